@@ -6,6 +6,6 @@ evaluation = evaluate(model, observations)
 report("report.html", observations, model, evaluation)
 """
 
-from thermostand.foundation.lazy_names import lazy_names
+from thermostand.foundation.lazy_names import make_lazy_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
+__getattr__, __dir__, __all__ = make_lazy_names(__name__, __file__)

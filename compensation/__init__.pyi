@@ -1,5 +1,5 @@
-from thermostand.compensation.arrays import observations_of as observations_of
-from thermostand.compensation.arrays import states as states
+from thermostand.compensation.array_observations import observations_of as observations_of
+from thermostand.compensation.array_observations import states as states
 from thermostand.compensation.calibration.board import Board as Board
 from thermostand.compensation.calibration.calibrate import CameraCalibration as CameraCalibration
 from thermostand.compensation.calibration.calibrate import calibrate as calibrate
@@ -11,15 +11,15 @@ from thermostand.compensation.calibration.session_centres import observe_positio
 from thermostand.compensation.calibration.stage_geometry import TableSigma as TableSigma
 from thermostand.compensation.calibration.views import ViewCalibration as ViewCalibration
 from thermostand.compensation.calibration.views import calibrate_views as calibrate_views
-from thermostand.compensation.drift.anchoring import anchored as anchored
-from thermostand.compensation.drift.anchoring import fit_like as fit_like
-from thermostand.compensation.drift.choosing import fit as fit
 from thermostand.compensation.drift.drift_model import DriftModel as DriftModel
 from thermostand.compensation.drift.drift_model import Outside as Outside
 from thermostand.compensation.drift.evaluation import Evaluation as Evaluation
 from thermostand.compensation.drift.evaluation import evaluate as evaluate
 from thermostand.compensation.drift.model_file import load_model as load_model
 from thermostand.compensation.drift.model_file import save_model as save_model
+from thermostand.compensation.drift.model_selection import fit as fit
+from thermostand.compensation.drift.rereference import fit_like as fit_like
+from thermostand.compensation.drift.rereference import rereference as rereference
 from thermostand.compensation.finding.finder import finder as finder
 from thermostand.compensation.history.thermal_history import States as States
 from thermostand.compensation.observations import Observations as Observations

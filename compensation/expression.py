@@ -48,7 +48,7 @@ def lag(of: Expression, tau_s: float) -> Expression:
     return Expression(("lag", of, tau_s))
 
 
-def play(of: Expression, radius_K: float) -> Expression:
+def backlash(of: Expression, radius_K: float) -> Expression:
     """A dead zone of this radius, above 0."""
     return Expression(("play", of, radius_K))
 
@@ -65,29 +65,29 @@ class Origin:
     camera_degC: float
     ambient_degC: float
 
-    def bound(self, feature: Feature) -> Feature:
+    def bind(self, feature: Feature) -> Feature:
         """The feature with numbers in place of what is `away` from the reference."""
         if not isinstance(feature, tuple):
             return feature
         if feature[0] == "away":
-            return (self.bound(feature[1]) - self.at_rest(feature[1])) / SPAN_K
-        return Expression((feature[0], *map(self.bound, feature[1:]))) if feature not in INPUTS else feature
+            return (self.bind(feature[1]) - self.evaluate_at_rest(feature[1])) / SPAN_K
+        return Expression((feature[0], *map(self.bind, feature[1:]))) if feature not in INPUTS else feature
 
-    def at_rest(self, feature: Any) -> float:
+    def evaluate_at_rest(self, feature: Any) -> float:
         """What a feature without `away` is in equilibrium at the reference, of a camera that is on."""
         if isinstance(feature, tuple) and feature[0] in ("lag", "play"):
-            return self.at_rest(feature[1])
+            return self.evaluate_at_rest(feature[1])
         if not isinstance(feature, tuple) or feature in INPUTS:
             inputs = (self.camera_degC, self.ambient_degC, 1.0)
             return compiled(feature, {one: place for place, one in enumerate(INPUTS)})(inputs)
-        parts = [self.at_rest(part) for part in feature[1:]]
+        parts = [self.evaluate_at_rest(part) for part in feature[1:]]
         return compiled((feature[0], *parts), {})(())
 
 
 _PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "**": 3}
 
 
-def in_c(feature: Feature, at: Mapping[Any, str]) -> str:
+def format_c(feature: Feature, at: Mapping[Any, str]) -> str:
     """A C expression of doubles; at: how inputs, lags and plays are written."""
     if not isinstance(feature, tuple):
         return repr(float(feature))
@@ -95,41 +95,41 @@ def in_c(feature: Feature, at: Mapping[Any, str]) -> str:
         return at[feature]
     operation, one, other = feature
     if operation == "**":
-        return "(" + " * ".join([in_c(one, at)] * other) + ")"
-    return f"({in_c(one, at)} {operation} {in_c(other, at)})"
+        return "(" + " * ".join([format_c(one, at)] * other) + ")"
+    return f"({format_c(one, at)} {operation} {format_c(other, at)})"
 
 
 _LETTERS = {INPUTS[0]: "T", INPUTS[1]: "air", INPUTS[2]: "supply"}
 _LAGGED = {INPUTS[0]: "camera", INPUTS[1]: "air", INPUTS[2]: "supply"}
 
 
-def in_words(feature: Feature) -> str:
+def format_words(feature: Feature) -> str:
     """As the formula of a report has it: air(8 min)^2, play(3 K); what is `away` is called as what it is of."""
     if not isinstance(feature, tuple):
         return f"{feature:g}"
     match feature:
         case ("away", of):
-            return in_words(of)
+            return format_words(of)
         case ("lag", of, tau_s):
-            within = "" if of in _LAGGED else f"{in_words(of)}, "
+            within = "" if of in _LAGGED else f"{format_words(of)}, "
             return f"{_LAGGED.get(of, 'lag')}({within}{tau_s / 60:g} min)"
         case ("play", of, radius_K):
-            within = "" if of == CAMERA else f"{in_words(of)}, "
+            within = "" if of == CAMERA else f"{format_words(of)}, "
             return f"play({within}{radius_K:g} K)"
         case ("**", of, power):
-            return f"{_within(of, 3)}^{power}"
+            return f"{_bracket(of, 3)}^{power}"
         case ("*", one, other):
-            return f"{_within(one, 2)} {_within(other, 2)}"
+            return f"{_bracket(one, 2)} {_bracket(other, 2)}"
         case (operation, one, other):
             level = _PRECEDENCE[operation]
-            return f"{_within(one, level)} {operation} {_within(other, level + 1)}"
+            return f"{_bracket(one, level)} {operation} {_bracket(other, level + 1)}"
         case _:
             return _LETTERS[feature]
 
 
-def _within(feature: Any, level: int) -> str:
+def _bracket(feature: Any, level: int) -> str:
     """In brackets where it binds less than what is around it."""
-    text = in_words(feature)
+    text = format_words(feature)
     while isinstance(feature, Expression) and feature[0] == "away":
         feature = feature[1]
     return f"({text})" if isinstance(feature, Expression) and _PRECEDENCE.get(feature[0], 4) < level else text

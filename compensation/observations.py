@@ -16,19 +16,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from thermostand.compensation.camera_selection import find_channel, list_camera_frames, read_serial, select_camera
 from thermostand.compensation.finding.finder import Finder
-from thermostand.compensation.finding.piece import FoundMarkers, joined, pieces_of
-from thermostand.compensation.history.thermal_history import ThermalHistory, recorded_history
-from thermostand.compensation.one_camera import channel_of, own_frames, serial_of, take
+from thermostand.compensation.finding.piece import FoundMarkers, concatenate_markers, split_into_pieces
+from thermostand.compensation.history.thermal_history import ThermalHistory, read_history
 from thermostand.experiments.steps import Role
-from thermostand.foundation.documents import parse_document, yaml_data
+from thermostand.foundation.documents import parse_document, parse_yaml
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.items import Event
-from thermostand.foundation.progress import Report, unwatched
-from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, UNSETTLED, Frame
+from thermostand.foundation.progress import Report, hide_progress
+from thermostand.foundation.readings import TEMPERATURE_SUSPECT, UNSETTLED, Frame
 from thermostand.markers.noise import Noise, estimate_noise
 from thermostand.markers.target import Target
-from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.session import Say, Session, open_whole
 
@@ -42,7 +42,7 @@ CHANGED = "camera_offset_changed"
 _TRANSIENT_ROLES = frozenset({"warm_up", "settling", "other"})  # of a camera that is not in equilibrium anyway
 
 
-class TwoEquilibria(SessionError):
+class MixedEquilibria(SessionError):
     """A session has frames of two equilibria of the camera."""
 
 
@@ -53,12 +53,12 @@ def check_one_equilibrium(session: Session) -> None:
         gap_ns = event.data.get("gap_ns")
         if event.kind != CHANGED or not isinstance(gap_ns, int):
             continue
-        times_ns = _settled_frames_ns(session) if times_ns is None else times_ns
+        times_ns = _list_settled_frames_ns(session) if times_ns is None else times_ns
         if times_ns and min(times_ns) <= gap_ns < max(times_ns):
-            raise TwoEquilibria(
-                f"{session.path}: camera minus air was {_kelvin(event, 'before_K')} before the gap at "
-                f"{session.utc.local_text(gap_ns)} and {_kelvin(event, 'after_K')} after it; its frames are of two "
-                "equilibria of the camera, and are used together only with --across-gap"
+            raise MixedEquilibria(
+                f"{session.path}: camera minus air was {_format_kelvin(event, 'before_K')} before the gap at "
+                f"{session.utc.local_text(gap_ns)} and {_format_kelvin(event, 'after_K')} after it; its frames are of "
+                "two equilibria of the camera, and are used together only with --across-gap"
             )
 
 
@@ -69,15 +69,15 @@ def check_sessions(sessions: Iterable[Session], *, across_gap: bool) -> None:
             check_one_equilibrium(session)
 
 
-def _kelvin(event: Event, name: str) -> str:
+def _format_kelvin(event: Event, name: str) -> str:
     value_K = event.data.get(name)
     return f"{value_K:.2f} K" if isinstance(value_K, int | float) else "unknown"
 
 
-def _settled_frames_ns(session: Session) -> list[int]:
+def _list_settled_frames_ns(session: Session) -> list[int]:
     """Instants of the frames that count and were taken at a settled set-point."""
     roles = {mark.step_id: mark.parameters.get("role") for mark in session.steps() if "role" in mark.parameters}
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     return [
         meta.time_ns
         for meta in session.frame_metas()
@@ -173,7 +173,7 @@ class Observations:
         """(F,): usable frames taken for one of these purposes."""
         return self.usable & np.isin(self.role, [str(role) for role in roles])
 
-    def switched_on_ns(self, session: int, before_ns: int) -> int | None:
+    def find_switch_on_ns(self, session: int, before_ns: int) -> int | None:
         """When the camera's supply last came on before an instant of a session; None when that is not recorded."""
         if not self.histories:
             return None
@@ -183,7 +183,7 @@ class Observations:
         return int(earlier[-1]) if len(earlier) else None
 
 
-def session_target(session: Session) -> Target:
+def read_session_target(session: Session) -> Target:
     """The target attached to the session; SessionError when none is, ConfigError when it is wrong."""
     text = session.attachment("target.yaml")
     if text is None:
@@ -191,10 +191,10 @@ def session_target(session: Session) -> Target:
     return parse_document(text, Target, f"{session.path}: target.yaml")
 
 
-def session_noise(session: Session) -> Noise | None:
+def estimate_session_noise(session: Session) -> Noise | None:
     """The camera's noise, from the first frames; None when they do not determine it."""
     try:
-        channel = channel_of(session)
+        channel = find_channel(session)
         first = list(islice((each for each in session.frames() if each.channel == channel), _NOISE_FRAMES))
     except SessionError:  # the search for the markers comes to the same frame, and reports where it is
         return None
@@ -210,7 +210,7 @@ def observe_session(
     A frame without the target, of another size or without a camera temperature stays, with its reason. SessionError
     when no frame can be used at all.
     """
-    pieces = pieces_of(session, target, session_noise(session))
+    pieces = split_into_pieces(session, target, estimate_session_noise(session))
     total = sum(piece.frames for piece in pieces)
 
     def counted(done: int) -> None:
@@ -219,11 +219,11 @@ def observe_session(
 
     if not pieces:
         raise SessionError(f"{session.path}: no frame can be used; it has no frames")
-    found = joined((finder or Finder())(pieces, counted))
+    found = concatenate_markers((finder or Finder())(pieces, counted))
     seen = np.flatnonzero(found.reason == "")
     if not len(seen):
         raise SessionError(f"{session.path}: no frame can be used; {found.reason[0]}")
-    return _arrays(session, target, found, int(seen[0]))
+    return _build_observations(session, target, found, int(seen[0]))
 
 
 def read_frames(session: Session) -> Iterator[Frame]:
@@ -256,39 +256,39 @@ def observe(
     """
     sessions = [open_whole(path, incomplete) for path in ([paths] if isinstance(paths, Path | str) else paths)]
     for session in sessions:
-        take(session, camera)
+        select_camera(session, camera)
     check_sessions(sessions, across_gap=across_gap)
-    targets = [target or session_target(session) for session in sessions]
+    targets = [target or read_session_target(session) for session in sessions]
     parts: list[Observations] = []
     done = 0
-    with (progress or unwatched)("find markers", sum(session.frame_count for session in sessions)) as report:
+    with (progress or hide_progress)("find markers", sum(session.frame_count for session in sessions)) as report:
         for session, its_target in zip(sessions, targets, strict=True):
-            parts.append(observe_session(session, its_target, finder, _continued(report, done)))
+            parts.append(observe_session(session, its_target, finder, _offset_progress(report, done)))
             done += session.frame_count
     return concatenate(parts)
 
 
-def _continued(report: Report, done_before: float) -> Report:
+def _offset_progress(report: Report, done_before: float) -> Report:
     def continued(done: float, text: str) -> None:
         report(done_before + done, text)
 
     return continued
 
 
-def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -> Observations:
+def _build_observations(session: Session, target: Target, found: FoundMarkers, first: int) -> Observations:
     """first: the first frame with the target, whose size the others must have."""
     known = session.frames_table()
-    own = np.array(own_frames(session), np.int64)
+    own = np.array(list_camera_frames(session), np.int64)
     camera_degC, step_id = known.camera_degC[own], known.step_id[own]
-    reasons = _reasons(found, first, camera_degC, known.superseded[own], known.flags[own])
-    purposes = [_purpose(role, degC) for role, degC in zip(known.role[own], known.chamber_degC[own], strict=True)]
+    reasons = _explain_unusable(found, first, camera_degC, known.superseded[own], known.flags[own])
+    purposes = [_check_purpose(role, degC) for role, degC in zip(known.role[own], known.chamber_degC[own], strict=True)]
     unusable = (found.flags != 0) | np.array([bool(reason) for reason in reasons])[:, None]
     image = session.frame(int(own[first])).image
     return Observations(
         target=target,
-        sessions=(_facts(session, int(np.count_nonzero(found.doubtful))),),
+        sessions=(_collect_facts(session, int(np.count_nonzero(found.doubtful))),),
         image_size=(image.shape[1], image.shape[0]),
-        preview=_preview(image),
+        preview=_make_preview(image),
         session=np.zeros(len(reasons), np.int64),
         frame=own,
         time_ns=found.time_ns,
@@ -301,11 +301,11 @@ def _arrays(session: Session, target: Target, found: FoundMarkers, first: int) -
         covariance_px2=np.where(unusable[:, :, None, None], np.nan, found.covariance_px2),
         flags=np.where((found.reason == "")[:, None], found.flags, 0).astype(np.uint8),
         reasons=reasons,
-        histories=(recorded_history(session),),
+        histories=(read_history(session),),
     )
 
 
-def _reasons(
+def _explain_unusable(
     found: FoundMarkers, first: int, camera_degC: Float, superseded: NDArray[np.bool_], flags: NDArray[np.str_]
 ) -> tuple[str, ...]:
     """Why each frame cannot be used, "" when it can."""
@@ -319,7 +319,7 @@ def _reasons(
             reason = f"the image has {size_px[0]} x {size_px[1]} pixels, the session's {width} x {height}"
         elif not reason and math.isnan(degC):
             reason = "the camera's temperature is unknown"
-        elif not reason and TEMPERATURE_IN_DOUBT in flagged.split(","):
+        elif not reason and TEMPERATURE_SUSPECT in flagged.split(","):
             reason = "the camera's temperature is in doubt"
         elif not reason and UNSETTLED in flagged.split(","):
             reason = "the chamber was not in its band when the soak before it ended"
@@ -327,32 +327,32 @@ def _reasons(
     return tuple(reasons)
 
 
-def _purpose(role: str, chamber_degC: float) -> tuple[str, float]:
+def _check_purpose(role: str, chamber_degC: float) -> tuple[str, float]:
     """Role and set-point of a frame, from those of its step; OTHER, and NaN, unless both are known."""
     if role not in set(Role) or math.isnan(chamber_degC):
         return Role.OTHER, math.nan
     return role, chamber_degC
 
 
-def _facts(session: Session, doubtful: int) -> SessionFacts:
+def _collect_facts(session: Session, doubtful: int) -> SessionFacts:
     fields = ("session_id", "recipe", "operator", "software_version")
-    texts = {name: session.metadata.get(name, "") for name in fields} | {"camera_serial": serial_of(session)}
+    texts = {name: session.metadata.get(name, "") for name in fields} | {"camera_serial": read_serial(session)}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
     return SessionFacts(
         **texts,
         simulated=simulated,
         incomplete=len(session.incomplete),
         utc=session.utc,
-        spots=_spots(session),
+        spots=_read_spots(session),
         doubtful=doubtful,
         uid=session.metadata.get("uid", ""),
     )
 
 
-def _spots(session: Session) -> dict[str, tuple[NDArray[np.int64], Float]]:
+def _read_spots(session: Session) -> dict[str, tuple[NDArray[np.int64], Float]]:
     """The thermal imager's; nothing is read where the stand had none."""
     try:
-        config = yaml_data(session.attachment("config.yaml") or "", "config.yaml")
+        config = parse_yaml(session.attachment("config.yaml") or "", "config.yaml")
     except ConfigError:
         return {}
     if not isinstance(config, dict) or "imager" not in config:
@@ -361,7 +361,7 @@ def _spots(session: Session) -> dict[str, tuple[NDArray[np.int64], Float]]:
     return {name.removeprefix("imager."): session.readings(name) for name in names}
 
 
-def _preview(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+def _make_preview(image: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
     """The image at a width for the report; averaging before rounding takes most of the noise away."""
     import cv2  # fits from arrays need no OpenCV
 
@@ -377,7 +377,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
     SessionError when camera, target or image size differ: one model is of one camera.
     """
-    parts = _told_apart(parts)
+    parts = _disambiguate_ids(parts)
     first = parts[0]
     for index, part in enumerate(parts[1:], 1):
         _check_same(first, part)
@@ -396,7 +396,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     )
 
 
-def _told_apart(parts: Sequence[Observations]) -> list[Observations]:
+def _disambiguate_ids(parts: Sequence[Observations]) -> list[Observations]:
     """Sessions of one second and recipe have the same id: behind the first one's it says which they are."""
     known: dict[str, str] = {}
     told: list[Observations] = []
@@ -409,9 +409,9 @@ def _told_apart(parts: Sequence[Observations]) -> list[Observations]:
 
 
 def _check_same(first: Observations, other: Observations) -> None:
-    here, there = first.sessions[0], other.sessions[0]
+    here, second = first.sessions[0], other.sessions[0]
     pairs = {
-        "camera": (here.camera_serial, there.camera_serial),
+        "camera": (here.camera_serial, second.camera_serial),
         "target": (first.target.name, other.target.name),
         "number of markers": (first.target.count, other.target.count),
         "image size": (first.image_size, other.image_size),
@@ -419,5 +419,5 @@ def _check_same(first: Observations, other: Observations) -> None:
     for name, (one, two) in pairs.items():
         if one != two:
             raise SessionError(
-                f"sessions {here.session_id} and {there.session_id} cannot be combined: {name} {one} and {two}"
+                f"sessions {here.session_id} and {second.session_id} cannot be combined: {name} {one} and {two}"
             )

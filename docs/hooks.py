@@ -23,8 +23,8 @@ from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.drift.model_file import PaperFile, ThermalFile
 from thermostand.experiments.steps import STEPS, Step
 from thermostand.stand.commands.command_table import app as stand
-from thermostand.stand.commands.remedies import troubleshooting
-from thermostand.stand.config.reference import reference
+from thermostand.stand.commands.remedies import make_troubleshooting_page
+from thermostand.stand.config.reference import make_reference
 
 ROOT = Path(__file__).parents[1]
 SCHEMAS = ROOT / "configs" / "schema"
@@ -44,7 +44,7 @@ def on_files(files: Files, config: Any) -> Files:
     """Add a page for each schema, and the notebook as it was last executed."""
     for name, (page, title) in FILES.items():
         schema = json.loads((SCHEMAS / f"{name}.json").read_text(encoding="utf-8"))
-        files.append(File.generated(config, f"reference/{page}.md", content=reference(title, schema)))
+        files.append(File.generated(config, f"reference/{page}.md", content=make_reference(title, schema)))
     if not NOTEBOOK.exists():
         return files
     text, pictures = executed(json.loads(NOTEBOOK.read_text(encoding="utf-8")))
@@ -110,16 +110,16 @@ def _step(kind: type[Step]) -> Iterator[str]:
         yield from ("", f"Written as `- {kind.kind}`, with nothing behind it.", "")
         return
     schema = TypeAdapter(kind.form).json_schema(mode="validation")
-    table = reference("", schema).partition("\n\n")[2]
+    table = make_reference("", schema).partition("\n\n")[2]
     if "properties" in schema:
         yield from ("", table)
         return
     models = [model for model in schema.get("$defs", {}).values() if "properties" in model]
     for model in models:
-        yield from ("", reference("", model).partition("\n\n")[2])
+        yield from ("", make_reference("", model).partition("\n\n")[2])
     if not models:
         shown = {"type": "object", "properties": {kind.kind: schema}, "required": [kind.kind]}
-        yield from ("", reference("", shown).partition("\n\n")[2])
+        yield from ("", make_reference("", shown).partition("\n\n")[2])
 
 
 def _paragraphs(text: str) -> str:
@@ -128,7 +128,7 @@ def _paragraphs(text: str) -> str:
 
 def events() -> str:
     """The table of events, without the head of its page."""
-    text = troubleshooting()
+    text = make_troubleshooting_page()
     table = text[text.index("| event |") :]
     return table.replace("{", "&#123;").replace("}", "&#125;")  # else the last ones of a cell are taken for attributes
 
@@ -204,7 +204,7 @@ def model_files() -> str:
     first = ("PaperFile", "ThermalFile")
     order = [*first, *sorted(name for name in models if name not in first)]
     shown = {"properties": {}, "$defs": {name: models[name] for name in order}}
-    page = reference("", shown)
+    page = make_reference("", shown)
     return page[page.index("## ") :]
 
 

@@ -11,22 +11,22 @@ from thermostand.foundation.documents import Document
 Effect = Literal["sag", "dead_zone", "creep", "stick_slip", "unrepeated", "coarse_sensor", "far_air"]
 
 
-def _ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+def _check_order(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
         raise ValueError(f"{list(bounds)}: the lower bound comes first")
     return bounds
 
 
-Bounds = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Bounds = Annotated[tuple[float, float], AfterValidator(_check_order)]
 
 
-def _positive(bounds: tuple[float, float]) -> tuple[float, float]:
+def _check_positive(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] <= 0:
         raise ValueError(f"{list(bounds)}: expected bounds above 0")
     return bounds
 
 
-Positive = Annotated[Bounds, AfterValidator(_positive)]
+Positive = Annotated[Bounds, AfterValidator(_check_positive)]
 
 
 class SagNumbers(Document):

@@ -22,14 +22,14 @@ Line = Annotated[
 ]  # free text without control characters
 
 
-def ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+def check_ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     """The bounds; ValueError unless the first is the lower."""
     if bounds[0] >= bounds[1]:
         raise ValueError(f"{bounds} is not in ascending order")
     return bounds
 
 
-Range = Annotated[tuple[float, float], AfterValidator(ascending)]
+Range = Annotated[tuple[float, float], AfterValidator(check_ascending)]
 
 
 class Polled(Document):
@@ -115,7 +115,7 @@ class Identity:
         return any(now and then and now != then for now, then in pairs)
 
 
-def same_device(device: str, found: Identity, before: Identity | None) -> Identity:
+def check_same_device(device: str, found: Identity, before: Identity | None) -> Identity:
     """What has answered; DeviceFault, which names both, when another one answered before: it was exchanged, and nothing
     is known of the new one."""
     if before is not None and found.is_another_than(before):
@@ -125,14 +125,14 @@ def same_device(device: str, found: Identity, before: Identity | None) -> Identi
     return found
 
 
-def identity_event(device: str, identity: Identity, now_ns: int, camera: CameraSettings | None = None) -> Event:
+def make_identity_event(device: str, identity: Identity, now_ns: int, camera: CameraSettings | None = None) -> Event:
     """With the device's name, what it tells of itself, and of a camera the lens that its settings state ("" when they
     do not)."""
     data: dict[str, object] = {"device": device, **asdict(identity)}
-    said = str(identity)
+    text = str(identity)
     if not identity.serial_number:
-        said += "; it tells no serial number"
+        text += "; it tells no serial number"
     if camera is not None:
         data["lens"] = camera.lens
-        said += f", lens {camera.lens}" if camera.lens else ", its lens is not stated"
-    return DEVICE_IDENTITY.at(now_ns, said, **data)
+        text += f", lens {camera.lens}" if camera.lens else ", its lens is not stated"
+    return DEVICE_IDENTITY.at(now_ns, text, **data)

@@ -20,7 +20,7 @@ from thermostand.experiments.parameters import (
     TablePosition,
     Wait_s,
 )
-from thermostand.experiments.pieces import frames_at, homes_checked, moved, soak
+from thermostand.experiments.sequences import approach_position, capture_at, check_homes, make_soak
 from thermostand.experiments.steps import CloseFlap, Role, StartChamber, Step, StopChamber
 
 
@@ -34,7 +34,7 @@ class CalibrationGrid(MovingTable, Guaranteed):
     left_out: tuple[TablePosition, ...] = Field(default=(), max_length=1000)
 
     @model_validator(mode="after")
-    def _positions_left(self) -> Self:
+    def _check_positions(self) -> Self:
         if len(set(self.linear_mm)) < len(self.linear_mm) or len(set(self.rotary_deg)) < len(self.rotary_deg):
             raise ValueError("linear_mm or rotary_deg has the same position twice")
         for position in self.left_out:
@@ -62,15 +62,15 @@ class CalibrationGrid(MovingTable, Guaranteed):
         return len(self.positions)
 
 
-def calibration(parameters: CalibrationGrid) -> Iterator[Step]:
+def plan_calibration(parameters: CalibrationGrid) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped and the flap closed."""
     positions, reference_degC = parameters.positions, parameters.reference_degC
     yield CloseFlap()
     yield StartChamber(reference_degC)
-    yield from moved(positions[0])
-    yield from homes_checked()
-    yield soak(parameters.equilibrium_s, parameters)
+    yield from approach_position(positions[0])
+    yield from check_homes()
+    yield make_soak(parameters.equilibrium_s, parameters)
     for position in positions:
-        yield from frames_at(parameters, position, parameters.frames_per_position, Role.CALIBRATION, reference_degC)
-    yield from homes_checked()
+        yield from capture_at(parameters, position, parameters.frames_per_position, Role.CALIBRATION, reference_degC)
+    yield from check_homes()
     yield StopChamber()

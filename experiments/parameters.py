@@ -30,7 +30,7 @@ class CaptureParameters(Document):
     exposure_s: float = Field(default=0.1, gt=0, le=10)
 
     @model_validator(mode="after")
-    def _exposed_in_time(self) -> Self:
+    def _check_exposure(self) -> Self:
         if self.exposure_s > self.interval_s:
             raise ValueError(f"exposure_s {self.exposure_s} does not fit into interval_s {self.interval_s}")
         return self
@@ -65,7 +65,7 @@ class Settled(Document):
     drift_px_per_min: float = Field(default=0.003, gt=0, le=10)
 
     @model_validator(mode="after")
-    def _enough_looks(self) -> Self:
+    def _check_looks(self) -> Self:
         if self.window_s < 4 * self.look_every_s:
             raise ValueError(f"window_s {self.window_s} holds less than four looks every {self.look_every_s} s")
         return self
@@ -87,22 +87,22 @@ class Known(Document):
     wait_s: float = Field(default=120.0, ge=5, le=3600)
 
     @model_validator(mode="after")
-    def _dwells(self) -> Self:
+    def _check_dwells(self) -> Self:
         if min(self.soaks_s) < _SHORTEST_DWELL_s:
             raise ValueError(f"soaks_s has {min(self.soaks_s)}; a visit takes at least {_SHORTEST_DWELL_s:g} s")
         return self
 
 
-def _settled(value: object) -> object:
+def _expand_settled(value: object) -> object:
     """`settled` alone takes the defaults, `{settled: {...}}` has some of its own."""
-    return _either(value, {"settled": Settled})
+    return _expand_either(value, {"settled": Settled})
 
 
-def _settled_or_known(value: object) -> object:
-    return _either(value, {"settled": Settled, "known": Known})
+def _expand_settled_or_known(value: object) -> object:
+    return _expand_either(value, {"settled": Settled, "known": Known})
 
 
-def _either(value: object, kinds: Mapping[str, type[Settled | Known]]) -> object:
+def _expand_either(value: object, kinds: Mapping[str, type[Settled | Known]]) -> object:
     if isinstance(value, str) and value in kinds:
         return kinds[value]()
     if isinstance(value, dict) and len(cast("dict[object, object]", value)) == 1:
@@ -121,7 +121,9 @@ class _UntilSettled(Document):
     settled: Settled
 
 
-Until = Annotated[Settled | None, BeforeValidator(_settled, json_schema_input_type=_UntilSettled | Literal["settled"])]
+Until = Annotated[
+    Settled | None, BeforeValidator(_expand_settled, json_schema_input_type=_UntilSettled | Literal["settled"])
+]
 
 
 class _UntilKnown(Document):
@@ -133,7 +135,8 @@ class _UntilKnown(Document):
 UntilSettledOrKnown = Annotated[
     Settled | Known | None,
     BeforeValidator(
-        _settled_or_known, json_schema_input_type=_UntilSettled | _UntilKnown | Literal["settled"] | Literal["known"]
+        _expand_settled_or_known,
+        json_schema_input_type=_UntilSettled | _UntilKnown | Literal["settled"] | Literal["known"],
     ),
 ]
 

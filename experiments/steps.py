@@ -35,7 +35,7 @@ from thermostand.experiments.parameters import (
     WARMEST_degC,
     check_until,
 )
-from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.plugins import load_point
@@ -186,7 +186,7 @@ class Price:
         return max(0.0, self.stated_s + self.overhead_s)
 
 
-def usual_s(steps: Iterable[Step]) -> float:
+def estimate_duration_s(steps: Iterable[Step]) -> float:
     """What these steps take one after the other on a stand of which nothing is known, s."""
     found, total_s = Situation(), 0.0
     for step in steps:
@@ -242,7 +242,7 @@ class Step:
         """The fields as JSON-able values; without those that list nothing, such as a capture's cameras, or leave a
         default to the step."""
         values = asdict(cast("Any", self))  # each subclass is a dataclass
-        return {name: _json(value) for name, value in values.items() if value != () and value is not None}
+        return {name: _make_json(value) for name, value in values.items() if value != () and value is not None}
 
     @property
     def frame_count(self) -> int:
@@ -368,7 +368,7 @@ class SoakEntry(Guaranteed, _Timed):
     max_s: Wait_s | None = None
 
     @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_possible(self) -> Self:
         if reason := self.step.fault():
             raise ValueError(reason)
         return self
@@ -379,7 +379,7 @@ class SoakEntry(Guaranteed, _Timed):
         return Soak(self.duration_s, self.band_K, self.last_s, self.max_s, self.unsettled)
 
 
-def _time_alone(value: object) -> object:
+def _expand_time(value: object) -> object:
     """A number alone is its time, s."""
     return {"duration_s": value} if isinstance(value, int | float) else value
 
@@ -397,7 +397,7 @@ class Soak(Step):
     kind = "soak"
     is_setup = False
     ends_when_skipped = True
-    form = Annotated[SoakEntry, BeforeValidator(_time_alone, json_schema_input_type=Wait_s | SoakEntry)]
+    form = Annotated[SoakEntry, BeforeValidator(_expand_time, json_schema_input_type=Wait_s | SoakEntry)]
     duration_s: float
     band_K: float = SOAK_BAND_K
     last_s: float | None = None
@@ -410,7 +410,7 @@ class Soak(Step):
 
     @property
     def words(self) -> str:
-        return f"soak for {_span(self.duration_s)}"
+        return f"soak for {_format_span(self.duration_s)}"
 
     @property
     def longest_s(self) -> float:
@@ -429,7 +429,7 @@ class Soak(Step):
         """For how long before its end the chamber has to be in its band, s."""
         return min(_LAST_PART * self.duration_s, _LONGEST_LAST_S) if self.last_s is None else self.last_s
 
-    def longer(self, by_s: float) -> Soak:
+    def extend(self, by_s: float) -> Soak:
         """One that takes so much longer."""
         return replace(self, duration_s=self.duration_s + by_s, max_s=None if self.max_s is None else self.max_s + by_s)
 
@@ -441,7 +441,7 @@ class Soak(Step):
         return ""
 
     def placement_fault(self, found: Situation) -> str:
-        return _aired(found, self.longest_s)
+        return _explain_open_flap(found, self.longest_s)
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
         """Until the chamber has been in its band for the last part, too, where that is known."""
@@ -462,7 +462,7 @@ class SoakUntilSettledEntry(Settled):
     exposure_s: float = Field(default=0.1, gt=0, le=10)
 
     @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_possible(self) -> Self:
         check_until(self, self.max_s, "max_s")
         return self
 
@@ -513,11 +513,13 @@ class SoakUntilSettled(Step):
 
     @classmethod
     def of_form(cls, value: SoakUntilSettledEntry, at_degC: float | None) -> Iterable[Step]:
-        return (cls.until(value.max_s, value, value.exposure_s, _known(at_degC, "start_chamber before it")),)
+        return (
+            cls.until(value.max_s, value, value.exposure_s, _require_set_point(at_degC, "start_chamber before it")),
+        )
 
     @property
     def words(self) -> str:
-        return f"soak at {self.chamber_degC:g} °C until settled, at most {_span(self.max_s)}"
+        return f"soak at {self.chamber_degC:g} °C until settled, at most {_format_span(self.max_s)}"
 
     @property
     def longest_s(self) -> float:
@@ -534,7 +536,7 @@ class SoakUntilSettled(Step):
         """For how long before its end the chamber has to be in its band, s."""
         return min(_LAST_PART * self.max_s, _LONGEST_LAST_S)
 
-    def longer(self, by_s: float) -> SoakUntilSettled:
+    def extend(self, by_s: float) -> SoakUntilSettled:
         """One that waits longer at the least and at the most."""
         return replace(self, min_s=self.min_s + by_s, max_s=self.max_s + by_s)
 
@@ -545,7 +547,7 @@ class SoakUntilSettled(Step):
             return "the chamber has no set-point here; give start_chamber before it"
         if self.role is not Role.SETTLING:
             return f"the looks of a soak until settled have the role settling, not {self.role}"
-        return _aired(found, self.longest_s) or _mislabelled(self.chamber_degC, found)
+        return _explain_open_flap(found, self.longest_s) or _explain_set_point_mismatch(self.chamber_degC, found)
 
     def stand_fault(self, stand: KnownStand) -> str:
         return stand.exposure_fault(self.chamber_degC) or stand.camera_fault()
@@ -562,13 +564,13 @@ AnySoak = Soak | SoakUntilSettled
 _CAMERA_OFF = "the camera is off here; give power_camera: on before it"
 
 
-def _aired(found: Situation, longest_s: float) -> str:
+def _explain_open_flap(found: Situation, longest_s: float) -> str:
     if not found.flap_open or longest_s <= _OPEN_S:
         return ""
     return f"the flap is open here, and the laboratory's air comes in for {longest_s:g} s; give close_flap"
 
 
-def _mislabelled(chamber_degC: float, found: Situation) -> str:
+def _explain_set_point_mismatch(chamber_degC: float, found: Situation) -> str:
     if found.set_point_degC is None or chamber_degC == found.set_point_degC:
         return ""
     return (
@@ -577,7 +579,7 @@ def _mislabelled(chamber_degC: float, found: Situation) -> str:
     )
 
 
-def _known(degC: float | None, remedy: str) -> float:
+def _require_set_point(degC: float | None, remedy: str) -> float:
     if degC is None:
         raise ValueError(f"the chamber has no set-point here; give {remedy}")
     return degC
@@ -588,7 +590,7 @@ _FLAP_TRAVEL_S = 3.0
 _FLAP_AT_REST_S = 0.2
 
 
-def _flap_price(travels: bool) -> Price:
+def _price_flap(travels: bool) -> Price:
     return Price("flap travel", 0.0, _FLAP_TRAVEL_S) if travels else Price("flap at rest", 0.0, _FLAP_AT_REST_S)
 
 
@@ -601,7 +603,7 @@ class OpenFlap(Step):
     says = "open the flap"
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
-        return _flap_price(not found.flap_open)
+        return _price_flap(not found.flap_open)
 
     def situation_after(self, found: Situation) -> Situation:
         return replace(found, flap_open=True)
@@ -619,7 +621,7 @@ class CloseFlap(Step):
     says = "close the flap"
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
-        return _flap_price(found.flap_open)
+        return _price_flap(found.flap_open)
 
     def situation_after(self, found: Situation) -> Situation:
         return replace(found, flap_open=False)
@@ -639,7 +641,7 @@ class CaptureEntry(CaptureParameters):
     cameras: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _has_a_purpose(self) -> Self:
+    def _check_purpose(self) -> Self:
         if self.role is Role.SETTLING:
             raise ValueError("role settling is kept for the looks of soak_until_settled; give another one, or none")
         return self
@@ -665,7 +667,7 @@ class Capture(Step):
 
     @classmethod
     def of_form(cls, value: CaptureEntry, at_degC: float | None) -> Iterable[Step]:
-        degC = _known(
+        degC = _require_set_point(
             at_degC if value.chamber_degC is None else value.chamber_degC, "start_chamber before it, or chamber_degC"
         )
         return (cls(value.frames, value.interval_s, value.exposure_s, value.role, degC, value.cameras),)
@@ -687,7 +689,7 @@ class Capture(Step):
             return "role settling is kept for the looks of a soak until settled; give another one"
         if not found.flap_open and self.role is not Role.OTHER:
             return f"the flap is closed here, and {self.role} frames show the target; give open_flap before it"
-        return _mislabelled(self.chamber_degC, found)
+        return _explain_set_point_mismatch(self.chamber_degC, found)
 
     def stand_fault(self, stand: KnownStand) -> str:
         interval_s = self.interval_s if self.frames > 1 else None
@@ -802,7 +804,7 @@ class CoolDown(Step):
 
     @property
     def words(self) -> str:
-        return f"camera cools down to within {self.band_K:g} K, at most {_span(self.max_s)}"
+        return f"camera cools down to within {self.band_K:g} K, at most {_format_span(self.max_s)}"
 
     @property
     def needed_s(self) -> float:
@@ -822,7 +824,7 @@ class CoolDown(Step):
         await stand.imaging.cool_down(self.band_K, self.time_constant_s, self.max_s)
 
 
-def _as_list(value: object) -> object:
+def _make_list(value: object) -> object:
     return [value] if isinstance(value, str) else value
 
 
@@ -834,7 +836,7 @@ class CheckHome(Step):
     is_setup = False
     says = "check the home of {axis}"
     form = Annotated[
-        tuple[str, ...], Field(min_length=1), BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...])
+        tuple[str, ...], Field(min_length=1), BeforeValidator(_make_list, json_schema_input_type=str | tuple[str, ...])
     ]
     axis: str
 
@@ -876,7 +878,7 @@ _DECIDE_S = 10.0
 @dataclass(frozen=True, slots=True)
 class Decide(Step):
     """Ask what to visit next, or whether enough is known: the answer replaces what is left of its cycle, which are
-    visits of `set_points_degC` for `soak_s` each (experiments/known.py).
+    visits of `set_points_degC` for `soak_s` each (experiments/adaptive.py).
 
     Wanted is a predicted residual of `residual_px` from `coldest_degC` to `warmest_degC`, over `states`: of a camera
     `at_rest`, 4 h after a change, or `on_the_way`, 45 min after it. No temperature outside is visited, none of
@@ -915,7 +917,7 @@ class Decide(Step):
         return Price(self.kind, _DECIDE_S)
 
 
-def kind_of_step(kind: str) -> type[Step] | None:
+def find_step_kind(kind: str) -> type[Step] | None:
     """The class of that name, which another package may add; None when there is none. ConfigError when the package
     that adds it cannot be loaded."""
     if kind not in STEPS and kind.islower():  # what other versions called `Soak` is not looked for, mark by mark
@@ -929,16 +931,16 @@ def _adapter(step: type[Step]) -> TypeAdapter[Step]:
     return TypeAdapter(step)
 
 
-def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
+def make_step(kind: str, parameters: Mapping[str, object]) -> Step:
     """The step of that kind and these `parameters`; ConfigError when there is none such."""
-    if (known := kind_of_step(kind)) is None:
+    if (known := find_step_kind(kind)) is None:
         raise ConfigError(f"no step is called {kind!r}; there are {', '.join(STEPS)}")
     if unknown := sorted(set(parameters) - {each.name for each in fields(cast("Any", known))}):
         raise ConfigError(f"{kind} has no {', '.join(unknown)}")
     try:
         step = _adapter(known).validate_python(dict(parameters))
     except ValidationError as error:
-        wrong = "; ".join(f"{path_text(each['loc'])}: {each['msg']}" for each in error.errors())
+        wrong = "; ".join(f"{format_path(each['loc'])}: {each['msg']}" for each in error.errors())
         raise ConfigError(f"{kind}: {wrong}") from error
     for name, value in step.parameters.items():
         least = 1 if name == "frames" else 0 if name.endswith("_s") or name == "band_K" else -math.inf
@@ -949,15 +951,15 @@ def step_of(kind: str, parameters: Mapping[str, object]) -> Step:
     return step
 
 
-def words_of(kind: str, parameters: Mapping[str, object]) -> str:
+def describe_step(kind: str, parameters: Mapping[str, object]) -> str:
     """A recorded step in words; kind and parameters as they are for one that is not known."""
     try:
-        return step_of(kind, parameters).words
+        return make_step(kind, parameters).words
     except ConfigError:
         return " ".join([kind, *(f"{name}={value}" for name, value in parameters.items())])
 
 
-def schema_of_steps() -> dict[str, object]:
+def make_step_schema() -> dict[str, object]:
     """The JSON Schema of any step's parameters, with a definition for each kind, by its name. readOnly: what follows
     from the plan; `chamber_degC` of frames need not be given."""
     definitions: dict[str, Any] = {}
@@ -986,11 +988,11 @@ def number_steps(steps: Iterable[Step], first: int = 0) -> Iterator[PlannedStep]
         yield PlannedStep(index, hashlib.sha256(text.encode()).hexdigest()[:12], step)
 
 
-def _json(value: object) -> object:
+def _make_json(value: object) -> object:
     return str(value) if isinstance(value, StrEnum) else value
 
 
-def _span(duration_s: float) -> str:
+def _format_span(duration_s: float) -> str:
     """`45 s`, `3 min 30 s`, `45 min`, `2 h 30 min`."""
     if duration_s < 120.0:
         return f"{duration_s:g} s"

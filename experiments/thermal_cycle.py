@@ -7,7 +7,7 @@ With `until: settled` a dwell ends when the camera has settled, at the latest af
 short looks at the target too.
 
 With `until: known` (experimental) the visits are decided one after the other, and the cycle ends when enough is known
-(experiments/known.py).
+(experiments/adaptive.py).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from thermostand.experiments.known import MOST_VISITS, first_decision, fixed_visits
+from thermostand.experiments.adaptive import MOST_VISITS, begin_cycle, plan_fixed_visits
 from thermostand.experiments.parameters import (
     Chamber_degC,
     FrameCount,
@@ -28,7 +28,7 @@ from thermostand.experiments.parameters import (
     Wait_s,
     check_until,
 )
-from thermostand.experiments.pieces import dwell, frames_through_flap, placed, soak
+from thermostand.experiments.sequences import capture_through_flap, make_set_point_soak, make_soak, move_table
 from thermostand.experiments.steps import SOAK_BAND_K, CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
 
 
@@ -48,7 +48,7 @@ class ThermalCycle(StillTable, Guaranteed):
     frames_per_point: FrameCount = 1
 
     @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_possible(self) -> Self:
         unvisited = sorted(set(self.held_out_degC) - set(self.set_points_degC))
         if unvisited:
             raise ValueError(f"held_out_degC has {unvisited}, which set_points_degC never visits")
@@ -70,27 +70,29 @@ class ThermalCycle(StillTable, Guaranteed):
         return len(self.set_points_degC) * self.cycles
 
 
-def thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
+def plan_thermal_cycle(parameters: ThermalCycle) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped and the flap closed."""
     yield CloseFlap()
-    yield from placed(parameters.table_position)
+    yield from move_table(parameters.table_position)
     yield StartChamber(parameters.reference_degC)
-    yield soak(parameters.equilibrium_s, parameters)
-    yield from frames_through_flap(parameters, parameters.reference_frames, Role.REFERENCE, parameters.reference_degC)
+    yield make_soak(parameters.equilibrium_s, parameters)
+    yield from capture_through_flap(parameters, parameters.reference_frames, Role.REFERENCE, parameters.reference_degC)
     if isinstance(parameters.until, Known):
-        yield from _deciding(parameters, parameters.until)
+        yield from _plan_adaptive_cycle(parameters, parameters.until)
         return
     for _ in range(parameters.cycles):
         for chamber_degC in parameters.set_points_degC:
             yield SetTemperature(chamber_degC)
-            yield dwell(parameters.soak_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
+            yield make_set_point_soak(
+                parameters.soak_s, parameters.until, parameters, parameters.exposure_s, chamber_degC
+            )
             role = Role.VALIDATION if chamber_degC in parameters.held_out_degC else Role.FIT
-            yield from frames_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
+            yield from capture_through_flap(parameters, parameters.frames_per_point, role, chamber_degC)
     yield StopChamber()
 
 
-def _deciding(parameters: ThermalCycle, known: Known) -> Iterator[Step]:
-    decide = first_decision(
+def _plan_adaptive_cycle(parameters: ThermalCycle, known: Known) -> Iterator[Step]:
+    decide = begin_cycle(
         known,
         parameters.set_points_degC * parameters.cycles,
         parameters.held_out_degC,
@@ -99,5 +101,5 @@ def _deciding(parameters: ThermalCycle, known: Known) -> Iterator[Step]:
         parameters,
     )
     yield decide
-    yield from fixed_visits(decide)
+    yield from plan_fixed_visits(decide)
     yield StopChamber()

@@ -23,7 +23,7 @@ from thermostand.experiments.parameters import (
     Wait_s,
     check_until,
 )
-from thermostand.experiments.pieces import dwell, frames_at, homes_checked, moved, soak
+from thermostand.experiments.sequences import approach_position, capture_at, check_homes, make_set_point_soak, make_soak
 from thermostand.experiments.steps import CloseFlap, Role, SetTemperature, StartChamber, Step, StopChamber
 
 
@@ -42,7 +42,7 @@ class Validation(MovingTable, Guaranteed):
     check_home_every: int = Field(default=3, ge=1, le=100)
 
     @model_validator(mode="after")
-    def _possible(self) -> Self:
+    def _check_possible(self) -> Self:
         if len(set(self.temperatures_degC)) < len(self.temperatures_degC):
             raise ValueError("temperatures_degC has the same temperature twice")
         if len(set(self.positions)) < len(self.positions):
@@ -56,27 +56,27 @@ class Validation(MovingTable, Guaranteed):
         return len(self.temperatures_degC) * (len(self.positions) + 1)
 
 
-def validation(parameters: Validation) -> Iterator[Step]:
+def plan_validation(parameters: Validation) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped and the flap closed."""
     reference_degC, *others_degC = parameters.temperatures_degC
     yield CloseFlap()
     yield StartChamber(reference_degC)
-    yield from moved(parameters.positions[0])
-    yield from homes_checked()
-    yield soak(parameters.equilibrium_s, parameters)
-    yield from _poses(parameters, reference_degC, parameters.reference_frames)
+    yield from approach_position(parameters.positions[0])
+    yield from check_homes()
+    yield make_soak(parameters.equilibrium_s, parameters)
+    yield from _plan_poses(parameters, reference_degC, parameters.reference_frames)
     for number, chamber_degC in enumerate(others_degC, start=1):
         if number % parameters.check_home_every == 0:
-            yield from homes_checked()
+            yield from check_homes()
         yield SetTemperature(chamber_degC)
-        yield dwell(parameters.soak_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
-        yield from _poses(parameters, chamber_degC, parameters.frames_per_position)
-    yield from homes_checked()
+        yield make_set_point_soak(parameters.soak_s, parameters.until, parameters, parameters.exposure_s, chamber_degC)
+        yield from _plan_poses(parameters, chamber_degC, parameters.frames_per_position)
+    yield from check_homes()
     yield StopChamber()
 
 
-def _poses(parameters: Validation, chamber_degC: float, frames: int) -> Iterator[Step]:
+def _plan_poses(parameters: Validation, chamber_degC: float, frames: int) -> Iterator[Step]:
     """Every position in turn, and the first once more."""
     for position in parameters.positions:
-        yield from frames_at(parameters, position, frames, Role.POSE, chamber_degC)
-    yield from frames_at(parameters, parameters.positions[0], frames, Role.REPEATABILITY, chamber_degC)
+        yield from capture_at(parameters, position, frames, Role.POSE, chamber_degC)
+    yield from capture_at(parameters, parameters.positions[0], frames, Role.REPEATABILITY, chamber_degC)

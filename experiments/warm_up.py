@@ -15,7 +15,7 @@ from typing import Annotated, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from thermostand.experiments.parameters import Chamber_degC, FrameCount, StillTable, Wait_s
-from thermostand.experiments.pieces import placed
+from thermostand.experiments.sequences import move_table
 from thermostand.experiments.steps import (
     Capture,
     CloseFlap,
@@ -50,7 +50,7 @@ class WarmUp(StillTable):
     cameras: tuple[CameraName, ...] = Field(default=(), max_length=20)
 
     @model_validator(mode="after")
-    def _each_once(self) -> Self:
+    def _check_unique(self) -> Self:
         if len(set(self.rolls_deg)) < len(self.rolls_deg):
             raise ValueError("rolls_deg has the same roll twice")
         if len(set(self.cameras)) < len(self.cameras):
@@ -63,7 +63,7 @@ class WarmUp(StillTable):
         return len(self.rolls_deg) * max(1, len(self.cameras))
 
 
-def warm_up(parameters: WarmUp) -> Iterator[Step]:
+def plan_warm_up(parameters: WarmUp) -> Iterator[Step]:
     """The steps, in order; ends with the chamber stopped, the flap closed and the camera on."""
     mounted, roll_deg = "", 0.0
     for camera in parameters.cameras or ("",):
@@ -75,15 +75,15 @@ def warm_up(parameters: WarmUp) -> Iterator[Step]:
             elif wanted_deg != roll_deg:
                 yield Prompt(f"roll the camera about its optical axis, from {roll_deg:g} to {wanted_deg:g} deg")
             mounted, roll_deg = camera, wanted_deg
-            yield from _once(parameters)
+            yield from _plan_one_warm_up(parameters)
 
 
-def _once(parameters: WarmUp) -> Iterator[Step]:
+def _plan_one_warm_up(parameters: WarmUp) -> Iterator[Step]:
     """One warm-up of a camera that is off."""
     chamber_degC = parameters.chamber_degC
     yield StartChamber(chamber_degC)
     yield CoolDown(parameters.band_K, parameters.time_constant_s, parameters.cool_down_max_s)
-    yield from placed(parameters.table_position)
+    yield from move_table(parameters.table_position)
     yield OpenFlap()
     yield PowerCamera(on=True)
     yield Capture(parameters.frames, parameters.interval_s, parameters.exposure_s, Role.WARM_UP, chamber_degC)

@@ -12,67 +12,67 @@ _TCP = re.compile(r"tcp:([^:\s]+):([0-9]{1,5})")
 _SERIAL = re.compile(r"serial:([^\s\x00]+)")
 
 
-class TcpPlace(NamedTuple):
+class TcpEndpoint(NamedTuple):
     """A port of a host."""
 
     host: str
     port: int
 
 
-class SerialPlace(NamedTuple):
+class SerialEndpoint(NamedTuple):
     """The path of a serial port."""
 
     path: str
 
 
-def tcp_place(address: str, *, may_be_free: bool = False) -> TcpPlace:
+def parse_tcp_address(address: str, *, may_be_free: bool = False) -> TcpEndpoint:
     """Where `tcp:HOST:PORT` leads; ValueError when it is none. Port 0, for a free one, only if it `may_be_free`."""
     found = _TCP.fullmatch(address)
     if found is None or not (0 if may_be_free else 1) <= int(found[2]) < 65536:
         raise ValueError("expected tcp:HOST:PORT with a port of 1..65535")
-    return TcpPlace(found[1], int(found[2]))
+    return TcpEndpoint(found[1], int(found[2]))
 
 
-def place_of(address: str) -> SerialPlace | TcpPlace:
+def parse_address(address: str) -> SerialEndpoint | TcpEndpoint:
     """Where `serial:PATH` or `tcp:HOST:PORT` leads; ValueError when it is neither."""
     if found := _SERIAL.fullmatch(address):
-        return SerialPlace(found[1])
+        return SerialEndpoint(found[1])
     if address.startswith("tcp:"):
-        return tcp_place(address)
+        return parse_tcp_address(address)
     raise ValueError("expected serial:PATH (such as serial:/dev/ttyUSB0) or tcp:HOST:PORT")
 
 
-def _byte_address(address: str) -> str:
-    place_of(address)
+def _check_byte_address(address: str) -> str:
+    parse_address(address)
     return address
 
 
-def _tcp_address(address: str) -> str:
-    tcp_place(address)
+def _check_tcp_address(address: str) -> str:
+    parse_tcp_address(address)
     return address
 
 
-def _ip_address(address: str) -> str:
+def _check_ip_address(address: str) -> str:
     try:
         return str(ipaddress.IPv4Address(address))
     except ValueError as error:
         raise ValueError("expected an IPv4 address such as 192.168.1.10") from error
 
 
-_STATED: dict[str, str] = {}  # where a stand's simulator answers -> what the stand's file says
+_DISPLAY_ADDRESSES: dict[str, str] = {}  # where a stand's simulator answers -> what the stand's file says
 
 
-def state_as(address: str, stated: str) -> None:
+def set_display_address(address: str, stated: str) -> None:
     """From now on `stated` is said where something is said of `address`: a simulator answers at a free place, which is
     another one each time, and the messages of a run are recorded."""
-    _STATED[address] = stated
+    _DISPLAY_ADDRESSES[address] = stated
 
 
-def stated(address: str) -> str:
+def get_display_address(address: str) -> str:
     """How a message names `address`: as the stand's file does."""
-    return _STATED.get(address, address)
+    return _DISPLAY_ADDRESSES.get(address, address)
 
 
-ByteAddress = Annotated[str, AfterValidator(_byte_address)]
-TcpAddress = Annotated[str, AfterValidator(_tcp_address)]
-IpAddress = Annotated[str, AfterValidator(_ip_address)]
+ByteAddress = Annotated[str, AfterValidator(_check_byte_address)]
+TcpAddress = Annotated[str, AfterValidator(_check_tcp_address)]
+IpAddress = Annotated[str, AfterValidator(_check_ip_address)]

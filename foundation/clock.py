@@ -52,7 +52,7 @@ class Clock(Now, Protocol):
         ...
 
 
-def seconds_ns(duration_s: float) -> int:
+def to_ns(duration_s: float) -> int:
     """A duration in s as a whole number of ns."""
     return round(duration_s * NS_PER_S)
 
@@ -151,7 +151,7 @@ class WallClock:
         return nullcontext()
 
 
-def boot_of(clock: Now) -> Boot | None:
+def get_boot(clock: Now) -> Boot | None:
     """The start of the host that `clock` counts from; None for virtual time, which has none."""
     return clock.boot if isinstance(clock, WallClock) else None
 
@@ -245,7 +245,7 @@ class VirtualClock:
 
     async def _rest(self) -> None:
         """Return when a task sleeps, nothing holds time, and the loop has nothing else to run."""
-        about_to_run = _about_to_run(asyncio.get_running_loop())
+        about_to_run = _get_ready_callbacks(asyncio.get_running_loop())
         while True:
             if self._holds or not self._sleepers:
                 self._changed.clear()
@@ -256,7 +256,7 @@ class VirtualClock:
                 return
 
 
-def call_pause_s(clock: Now, pause_s: float) -> float:
+def compute_call_pause_s(clock: Now, pause_s: float) -> float:
     """Real seconds to keep between two calls of a device that wants `pause_s`. In virtual time a call takes none, so
     none pass between the calls of one instant, and those of two instants are apart on the clock."""
     return 0.0 if isinstance(clock, VirtualClock) else pause_s
@@ -271,7 +271,7 @@ def block_until(clock: Now, time_ns: int) -> None:
         time.sleep(min(max(0, left_ns - _AWAKE_NS) / NS_PER_S, PIECE_S))  # noqa: TID251 - the one place that sleeps
 
 
-def _about_to_run(loop: asyncio.AbstractEventLoop) -> Sized:
+def _get_ready_callbacks(loop: asyncio.AbstractEventLoop) -> Sized:
     """The callbacks that `loop` will run next, without the one that runs now.
 
     asyncio keeps them to itself, under this name in every version so far. Counting quiet turns of the loop instead is a

@@ -10,8 +10,8 @@ from typing import Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
-from thermostand.foundation.exit_codes import one_line_errors
-from thermostand.foundation.output import Output, outputting
+from thermostand.foundation.exit_codes import exit_on_error
+from thermostand.foundation.output import Output, set_output
 from thermostand.foundation.usage import OneLineUsage, VersionOption
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -40,21 +40,21 @@ class App(typer.Typer):
         register = super().command(name, **settings)
 
         def take(function: Function) -> Function:
-            register(_with_common(_with_groups(function)))
+            register(_add_common_options(_expand_groups(function)))
             return function
 
         return take
 
 
-def _with_groups(function: Callable[..., Any]) -> Callable[..., Any]:
+def _expand_groups(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with the options of its groups instead of them."""
     for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if is_dataclass(parameter.annotation):
-            function = _with_group(function, name, cast("type[Any]", parameter.annotation))
+            function = _expand_group(function, name, cast("type[Any]", parameter.annotation))
     return function
 
 
-def _with_group(function: Callable[..., Any], group: str, kind: type[Any]) -> Callable[..., Any]:
+def _expand_group(function: Callable[..., Any], group: str, kind: type[Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
         chosen = {field.name: options.pop(field.name) for field in fields(kind)}
@@ -62,23 +62,23 @@ def _with_group(function: Callable[..., Any], group: str, kind: type[Any]) -> Ca
 
     hints = get_type_hints(kind, include_extras=True)
     added = {field.name: (hints[field.name], field.default) for field in fields(kind)}
-    return with_parameters(command, function, added, without=group)
+    return add_parameters(command, function, added, without=group)
 
 
-def _with_common(function: Callable[..., Any]) -> Callable[..., Any]:
+def _add_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with the common options behind its own; what it raises becomes its sentence and its exit status."""
 
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
         asked = {name: bool(options.pop(name, False)) for name in _COMMON}
         wanted = Output(asked["common_quiet"], asked["common_verbose"], asked["common_json"])
-        with outputting(wanted), one_line_errors():
+        with set_output(wanted), exit_on_error():
             return function(*args, **options)
 
-    return with_parameters(command, function, {name: (kind, False) for name, kind in _COMMON.items()})
+    return add_parameters(command, function, {name: (kind, False) for name, kind in _COMMON.items()})
 
 
-def with_parameters(
+def add_parameters(
     command: Callable[..., Any],
     function: Callable[..., Any],
     added: Mapping[str, tuple[Any, object]],

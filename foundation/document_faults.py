@@ -68,7 +68,7 @@ TAG = "<"  # begins the tags of our unions, which are no keys
 _TAGS = (TAG, "literal[")  # of what an older form lacks; and pydantic's of a choice of words
 
 
-class _Written:
+class _YamlDocument:
     """A document as its YAML has it. A mapping's keys are listed once, however many of them are looked up."""
 
     def __init__(self, root: yaml.Node | None) -> None:
@@ -80,17 +80,17 @@ class _Written:
         its value, None when it is not there."""
         line, node = None, self._root
         for part in place:
-            key, node = self._inside(node, part)
+            key, node = self._find_entry(node, part)
             if key is None:
                 break
             line = key.start_mark.line + 1
         return line, node
 
-    def place(self, fault: ErrorDetails) -> tuple[int | str, ...]:
+    def strip_union_tags(self, fault: ErrorDetails) -> tuple[int | str, ...]:
         """The fault's place, without the tags of unions, which pydantic puts between a key and those below it."""
         kept, node = list[int | str](), self._root
         for number, part in enumerate(fault["loc"]):
-            key, inner = self._inside(node, part)
+            key, inner = self._find_entry(node, part)
             is_last = number == len(fault["loc"]) - 1
             is_between = isinstance(node, yaml.MappingNode) if not is_last else fault["type"] == "model_type"
             if number and node is not None and key is None and is_between:
@@ -101,38 +101,38 @@ class _Written:
             node = inner
         return tuple(kept)
 
-    def _inside(self, node: yaml.Node | None, part: int | str) -> tuple[yaml.Node | None, yaml.Node | None]:
+    def _find_entry(self, node: yaml.Node | None, part: int | str) -> tuple[yaml.Node | None, yaml.Node | None]:
         """The key (of a list: the entry) of this name or number, and its value."""
         if isinstance(node, yaml.MappingNode):
-            return self._keys_of(node).get(str(part), (None, None))
+            return self._index_keys(node).get(str(part), (None, None))
         if isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
             return node.value[part], node.value[part]
         return None, None
 
-    def _keys_of(self, node: yaml.MappingNode) -> dict[str, tuple[yaml.Node, yaml.Node]]:
+    def _index_keys(self, node: yaml.MappingNode) -> dict[str, tuple[yaml.Node, yaml.Node]]:
         if id(node) not in self._keys:
             pairs = [(key, value) for key, value in node.value if isinstance(key, yaml.ScalarNode)]
             self._keys[id(node)] = {key.value: (key, value) for key, value in pairs}
         return self._keys[id(node)]
 
 
-def sentences(where: str, error: ValidationError, model: type[BaseModel], root: yaml.Node | None) -> str:
+def describe_faults(where: str, error: ValidationError, model: type[BaseModel], root: yaml.Node | None) -> str:
     """All faults of a document of this model, in one line; `root`: the YAML they are in."""
-    yaml_text = _Written(root)
-    faults = _causes([{**fault, "loc": yaml_text.place(fault)} for fault in error.errors()])
+    yaml_text = _YamlDocument(root)
+    faults = _keep_causes([{**fault, "loc": yaml_text.strip_union_tags(fault)} for fault in error.errors()])
     more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
     listed: set[tuple[int | str, ...]] = set()  # places whose keys were listed
     details: list[str] = []
     for fault in faults[:_MOST_FAULTS]:
         advice = ""
         if fault["type"] == "extra_forbidden":
-            advice = _about_key(fault["loc"], model, listed)
+            advice = _suggest_key(fault["loc"], model, listed)
             listed.add(fault["loc"][:-1])
-        details.append(_sentence(where, fault, yaml_text, advice))
+        details.append(_format_fault(where, fault, yaml_text, advice))
     return "; ".join(details) + more
 
 
-def yaml_fault(error: yaml.YAMLError | ValueError) -> str:
+def describe_yaml_error(error: yaml.YAMLError | ValueError) -> str:
     """Why a text is no YAML, where, and what to look for."""
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
@@ -145,14 +145,14 @@ def yaml_fault(error: yaml.YAMLError | ValueError) -> str:
     return " ".join(str(error).split())
 
 
-def words(fault: ErrorDetails, written: str | None = None) -> str:
+def describe_fault(fault: ErrorDetails, written: str | None = None) -> str:
     """What is wrong with a value, and what to type; written: the value as it stands in the file, where that is
     known."""
     kind, place = fault["type"], fault["loc"]
     if kind == "extra_forbidden":
         return "unknown key; correct its name, or take it out"
     if kind in _NUMBERS:
-        return _number(place, fault["input"], whole=kind.startswith("int"))
+        return _suggest_number(place, fault["input"], whole=kind.startswith("int"))
     if kind == "string_type":
         is_plain = written and not isinstance(fault["input"], dict | list)
         return f"give text, in quotes: '{written[:_LONGEST_VALUE]}'" if written and is_plain else "give text"
@@ -167,32 +167,32 @@ def words(fault: ErrorDetails, written: str | None = None) -> str:
     return text
 
 
-def words_for_numbers(where: str, data: object, model: type[BaseModel], root: yaml.Node | None) -> str:
+def describe_booleans_for_numbers(where: str, data: object, model: type[BaseModel], root: yaml.Node | None) -> str:
     """The sentence about `yes`, `no`, `on` or `off` where a number belongs, which would be 1 or 0; "" without such."""
-    yaml_text = _Written(root)
-    for place in _flags(data, ()):
-        types_ = {each for each in _types_at(model, place) if isinstance(each, type)}
+    yaml_text = _YamlDocument(root)
+    for place in _find_booleans(data, ()):
+        types_ = {each for each in _find_types(model, place) if isinstance(each, type)}
         if types_ and types_ <= {int, float, types.NoneType}:
             _, node = yaml_text.found(place)
             written = node.value if isinstance(node, yaml.ScalarNode) else ""
             kind = "float_type" if float in types_ else "int_type"
-            return _sentence(where, ErrorDetails(type=kind, loc=place, msg="", input=written), yaml_text, "")
+            return _format_fault(where, ErrorDetails(type=kind, loc=place, msg="", input=written), yaml_text, "")
     return ""
 
 
-def _flags(data: object, place: tuple[int | str, ...]) -> Iterator[tuple[int | str, ...]]:
+def _find_booleans(data: object, place: tuple[int | str, ...]) -> Iterator[tuple[int | str, ...]]:
     """The places of all true and false."""
     if isinstance(data, bool):
         yield place
     elif isinstance(data, dict):
         for key, value in cast("dict[object, object]", data).items():
-            yield from _flags(value, (*place, str(key)))
+            yield from _find_booleans(value, (*place, str(key)))
     elif isinstance(data, list):
         for number, value in enumerate(cast("list[object]", data)):
-            yield from _flags(value, (*place, number))
+            yield from _find_booleans(value, (*place, number))
 
 
-def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
+def _keep_causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
     """Without the faults that only follow from another one: a list is too short when its only entry is wrong, and who
     has mistyped one of a choice of words did not mean keys and values."""
     misspelt = {fault["loc"] for fault in faults if fault["type"] == "literal_error"}
@@ -203,26 +203,26 @@ def _causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
     return [fault for fault in faults if fault["type"] != "too_short" or fault["loc"] not in above]
 
 
-def _sentence(where: str, fault: ErrorDetails, yaml_text: _Written, advice: str) -> str:
+def _format_fault(where: str, fault: ErrorDetails, yaml_text: _YamlDocument, advice: str) -> str:
     """One fault as `file: path: what is wrong (got value, line N)`."""
     place = fault["loc"]
     line, node = yaml_text.found(place)
     written = node.value if isinstance(node, yaml.ScalarNode) else None
-    text = words(fault, written) + advice
+    text = describe_fault(fault, written) + advice
     if not place:  # about the whole: the sentence names what it is about
         return f"{where}: {text}"
     value, details = fault["input"], list[str]()
     if isinstance(node, yaml.ScalarNode) and value is None and not node.value:
         details.append("nothing stands behind the key")
     elif not isinstance(value, dict | list) and value is not None and fault["type"] != "extra_forbidden":
-        details.append(f"got {_shown(value)}")
+        details.append(f"got {_shorten(value)}")
     if line is not None:
         details.append(f"line {line}")
-    path = path_text((*place[:-1], str(place[-1])) if fault["type"] == "invalid_key" else place)
+    path = format_path((*place[:-1], str(place[-1])) if fault["type"] == "invalid_key" else place)
     return f"{where}: {path}: {text}" + (f" ({', '.join(details)})" if details else "")
 
 
-def path_text(place: Iterable[int | str]) -> str:
+def format_path(place: Iterable[int | str]) -> str:
     """A place as people read it: entries are counted from 1, as steps are everywhere. Of a key that is a number
     pydantic says so behind it."""
     parts = tuple(place)
@@ -232,7 +232,7 @@ def path_text(place: Iterable[int | str]) -> str:
     )
 
 
-def _number(place: Place, value: object, *, whole: bool) -> str:
+def _suggest_number(place: Place, value: object, *, whole: bool) -> str:
     """What to type instead of this value."""
     key = next((part for part in reversed(place) if isinstance(part, str)), "")
     unit = next((end for end in _UNITS if key.endswith(f"_{end}")), "")
@@ -244,9 +244,9 @@ def _number(place: Place, value: object, *, whole: bool) -> str:
     return text if size is None else f"{text}: {float(match[1].replace(',', '.')) * size:.12g}"
 
 
-def _about_key(place: tuple[int | str, ...], model: type[BaseModel], listed: set[tuple[int | str, ...]]) -> str:
+def _suggest_key(place: tuple[int | str, ...], model: type[BaseModel], listed: set[tuple[int | str, ...]]) -> str:
     """The key that may be meant, or those there are at this place unless they were listed before."""
-    known = sorted({name for each in _models_at(model, place[:-1]) for name in each.model_fields})
+    known = sorted({name for each in _find_models(model, place[:-1]) for name in each.model_fields})
     if near := nearest(str(place[-1]), known):
         return near
     return f"; known here: {', '.join(known)}" if known and place[:-1] not in listed else ""
@@ -258,22 +258,22 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _models_at(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
+def _find_models(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
     """The models that what stands at this place may be."""
-    return [each for each in _types_at(model, place) if isinstance(each, type) and issubclass(each, BaseModel)]
+    return [each for each in _find_types(model, place) if isinstance(each, type) and issubclass(each, BaseModel)]
 
 
-def _types_at(model: type[BaseModel], place: Place) -> list[Any]:
+def _find_types(model: type[BaseModel], place: Place) -> list[Any]:
     """What may stand at this place; nothing where that is not known."""
     options: list[Any] = [model]
     for part in place:
-        options = [inner for option in options for inner in _inside(option, part)]
-    return [each for option in options for each in _plain(option)]
+        options = [inner for option in options for inner in _find_entry_types(option, part)]
+    return [each for option in options for each in _flatten_union(option)]
 
 
-def _inside(annotation: Any, part: int | str) -> Iterator[Any]:
+def _find_entry_types(annotation: Any, part: int | str) -> Iterator[Any]:
     """The types of the entry `part` of values of this type."""
-    for option in _plain(annotation):
+    for option in _flatten_union(annotation):
         if isinstance(option, type) and issubclass(option, BaseModel):
             field = option.model_fields.get(str(part))
             if field is not None:
@@ -284,16 +284,16 @@ def _inside(annotation: Any, part: int | str) -> Iterator[Any]:
             yield from (each for each in get_args(option) if each is not Ellipsis)
 
 
-def _plain(annotation: Any) -> list[Any]:
+def _flatten_union(annotation: Any) -> list[Any]:
     """The types of a union, without what is annotated to them."""
     if get_origin(annotation) is Annotated:
-        return _plain(get_args(annotation)[0])
+        return _flatten_union(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
-        return [each for option in get_args(annotation) for each in _plain(option)]
+        return [each for option in get_args(annotation) for each in _flatten_union(option)]
     return [annotation]
 
 
-def _shown(value: object) -> str:
+def _shorten(value: object) -> str:
     """The value as it was given, shortened to what a reader needs to find it."""
     try:
         text = repr(value)

@@ -12,9 +12,14 @@ from typing import TYPE_CHECKING, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from thermostand.foundation.document_faults import path_text, sentences, words_for_numbers, yaml_fault
-from thermostand.foundation.errors import ConfigError, NotThere, SessionError
-from thermostand.foundation.files import unreadable, write_whole
+from thermostand.foundation.document_faults import (
+    describe_booleans_for_numbers,
+    describe_faults,
+    describe_yaml_error,
+    format_path,
+)
+from thermostand.foundation.errors import ConfigError, NotFound, SessionError
+from thermostand.foundation.files import describe_unreadable, write_atomically
 
 if TYPE_CHECKING or not yaml.__with_libyaml__:
     from yaml import SafeLoader as QuickLoader
@@ -59,12 +64,12 @@ class _Loader(_Strict, yaml.SafeLoader):
     """In Python: the one that says what is wrong with a text, and where."""
 
 
-class _Quick(_Strict, QuickLoader):
+class _FastLoader(_Strict, QuickLoader):
     """By libyaml, ten times as fast. It ends the process at ten thousands of levels, hence _MOST_OPENED."""
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
-_Quick.add_constructor("tag:yaml.org,2002:int", _Quick.construct_yaml_int)
+_FastLoader.add_constructor("tag:yaml.org,2002:int", _FastLoader.construct_yaml_int)
 
 
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
@@ -82,21 +87,21 @@ def read_document(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(unreadable(path, error)) from error
+        raise ConfigError(describe_unreadable(path, error)) from error
 
 
 def parse_document(text: str, model: type[Model], where: str) -> Model:
     """YAML text as `model`; `where` (a file name) begins every message of the ConfigError it may raise."""
-    data, root = _read(text, where)
+    data, root = _load_yaml(text, where)
     if not isinstance(data, dict):
         found = "nothing" if data is None else "a list" if isinstance(data, list) else "a value alone"
         raise ConfigError(f"{where}: begins with keys and values, as in `name: my-stand`; there is {found}")
-    if wrong := words_for_numbers(where, data, model, root):
+    if wrong := describe_booleans_for_numbers(where, data, model, root):
         raise ConfigError(wrong)
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(sentences(where, error, model, root)) from error
+        raise ConfigError(describe_faults(where, error, model, root)) from error
 
 
 def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
@@ -108,20 +113,20 @@ def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
             data = file.read(_LONGEST_JSON + 1)
         text = data.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        kind = NotThere if isinstance(error, FileNotFoundError) else SessionError
-        raise kind(unreadable(path, error)) from error
+        kind = NotFound if isinstance(error, FileNotFoundError) else SessionError
+        raise kind(describe_unreadable(path, error)) from error
     not_ours = f"{path}: not {what} of this program"
     if len(data) > _LONGEST_JSON:
         raise SessionError(f"{not_ours} (it has more than {_LONGEST_JSON // 10**6} MB, and such a file has less)")
     try:
-        json.loads(text, object_pairs_hook=_with_each_key_once)
+        json.loads(text, object_pairs_hook=_reject_repeated_keys)
         return read(text)
     except RecursionError:
         raise SessionError(f"{not_ours} (nested too deeply)") from None
     except ValidationError as error:
         fault = error.errors()[0]
         # What a file of another kind lacks is no news to a reader; what is wrong inside of one of this kind is.
-        where, kind_of_fault = path_text(fault["loc"]), fault["type"]
+        where, kind_of_fault = format_path(fault["loc"]), fault["type"]
         place = f"{where}: " if where else ""  # what concerns the whole file has none
         more = (
             "" if kind_of_fault.startswith("union_tag") else f" ({place}{fault['msg'].removeprefix('Value error, ')})"
@@ -131,7 +136,7 @@ def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
         raise SessionError(f"{not_ours} ({error}){_MAKE_AGAIN}") from error
 
 
-def _with_each_key_once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+def _reject_repeated_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
     """JSON parsers keep the last of two equal keys without a word."""
     found = dict(pairs)
     if len(found) < len(pairs):
@@ -141,39 +146,39 @@ def _with_each_key_once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return found
 
 
-def yaml_data(text: str, where: str) -> object:
+def parse_yaml(text: str, where: str) -> object:
     """What YAML text holds; ConfigError, which begins with `where`, when it is no YAML or far more than a document of
     ours: a few lines of aliases stand for millions of values."""
-    return _read(text, where)[0]
+    return _load_yaml(text, where)[0]
 
 
-def _read(text: str, where: str) -> tuple[object, yaml.Node | None]:
+def _load_yaml(text: str, where: str) -> tuple[object, yaml.Node | None]:
     """What YAML text holds, and as it is written."""
     if len(text) > _LONGEST_TEXT:
         raise ConfigError(f"{where}: has {len(text)} characters; a file of this kind has at most {_LONGEST_TEXT}")
     if sum(map(text.count, "[{-?")) <= _MOST_OPENED:
         with suppress(RecursionError, yaml.YAMLError, ValueError, LookupError, AttributeError):
-            return _constructed(_Quick(text), where)
+            return _construct(_FastLoader(text), where)
     try:
-        return _constructed(_Loader(text), where)
+        return _construct(_Loader(text), where)
     except RecursionError:
         raise ConfigError(f"{where}: not YAML that can be read (nested too deeply)") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: a number or a date that Python cannot represent
-        raise ConfigError(f"{where}: not YAML ({yaml_fault(error)})") from error
+        raise ConfigError(f"{where}: not YAML ({describe_yaml_error(error)})") from error
     except (LookupError, AttributeError) as error:  # what PyYAML lets out at a tag such as !!bool x
         raise ConfigError(f"{where}: not YAML (a value does not fit its tag)") from error
 
 
-def _constructed(loader: _Loader | _Quick, where: str) -> tuple[object, yaml.Node | None]:
+def _construct(loader: _Loader | _FastLoader, where: str) -> tuple[object, yaml.Node | None]:
     node = loader.get_single_node()
     if node is None:
         return None, None
-    if _size(node, {}) > _MOST_VALUES:
+    if _count_values(node, {}) > _MOST_VALUES:
         raise ConfigError(f"{where}: aliases stand for more than {_MOST_VALUES} values; write out what is meant")
     return loader.construct_document(node), node
 
 
-def _size(node: yaml.Node, known: dict[int, int]) -> int:
+def _count_values(node: yaml.Node, known: dict[int, int]) -> int:
     """How many values a node stands for, each alias for as many as what it names; RecursionError when it is within
     itself. `known`: of the nodes seen so far."""
     if not isinstance(node, yaml.CollectionNode):
@@ -181,14 +186,14 @@ def _size(node: yaml.Node, known: dict[int, int]) -> int:
     if id(node) not in known:
         known[id(node)] = _MOST_VALUES  # within itself
         parts = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
-        known[id(node)] = 1 + sum(_size(part, known) for part in parts)
+        known[id(node)] = 1 + sum(_count_values(part, known) for part in parts)
     return known[id(node)]
 
 
 # JSON Schemas of documents, for editors: generated from the models, so that they always agree.
 
 
-def schema_text(model: type[BaseModel]) -> str:
+def format_schema(model: type[BaseModel]) -> str:
     """The schema of documents of this model."""
     schema = model.model_json_schema()
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
@@ -200,6 +205,6 @@ def write_schemas(directory: Path, documents: Mapping[str, type[BaseModel]]) -> 
         directory.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, model in documents.items():
-        write_whole(directory / f"{name}.json", schema_text(model))
+        write_atomically(directory / f"{name}.json", format_schema(model))
         written.append(directory / f"{name}.json")
     return tuple(written)

@@ -15,7 +15,7 @@
     ├── StandTripped           the guard has made the stand safe; an operator must reset it
     │   └── NotReset           ... and nobody has, in virtual time
     ├── SessionError           a recorded session cannot be read
-    │   └── NotThere           what was named is not there: bad input, for a program
+    │   └── NotFound           what was named is not there: bad input, for a program
     ├── DetectionError         no target in the image, or one that is not identified beyond doubt
     └── CalibrationError       observations that do not determine a camera, or a pose
 
@@ -99,7 +99,7 @@ class SessionError(StandError):
     """A recorded session is missing, damaged or not of our making."""
 
 
-class NotThere(SessionError):
+class NotFound(SessionError):
     """What was named is not there: no such folder or file, or a folder that is no session."""
 
 

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 import typer
 
-from thermostand.foundation.errors import ConfigError, Interrupted, NotReset, NotThere, StandError
-from thermostand.foundation.output import output
-from thermostand.foundation.usage import ended, failed
+from thermostand.foundation.errors import ConfigError, Interrupted, NotFound, NotReset, StandError
+from thermostand.foundation.output import get_output
+from thermostand.foundation.usage import report_end, report_failure
 
 FAILED = 1
 BAD_INPUT = 2
@@ -22,26 +22,26 @@ INTERRUPTED = 130
 
 
 @contextmanager
-def one_line_errors() -> Generator[None]:
+def exit_on_error() -> Generator[None]:
     """What is raised inside becomes its sentence and its exit status."""
     try:
         yield
-    except (ConfigError, NotThere) as error:
-        raise _failed(error, BAD_INPUT) from error
+    except (ConfigError, NotFound) as error:
+        raise _make_exit(error, BAD_INPUT) from error
     except BrokenPipeError:  # the reader of our output has closed it; typer ends quietly
         raise
     except Interrupted as error:
-        raise ended(error, INTERRUPTED) from error
+        raise report_end(error, INTERRUPTED) from error
     except NotReset as error:
-        raise _failed(error, NOT_RESET) from error
+        raise _make_exit(error, NOT_RESET) from error
     except (StandError, OSError) as error:
-        raise _failed(error, FAILED) from error
+        raise _make_exit(error, FAILED) from error
     except KeyboardInterrupt as error:
-        raise ended("interrupted", INTERRUPTED) from error
+        raise report_end("interrupted", INTERRUPTED) from error
 
 
-def _failed(error: BaseException, status: int) -> typer.Exit:
+def _make_exit(error: BaseException, status: int) -> typer.Exit:
     """With its sentence; with -v where it came from first."""
-    if output().verbose:
+    if get_output().verbose:
         typer.echo("".join(traceback.format_exception(error)), err=True, nl=False)
-    return failed(error, status)
+    return report_failure(error, status)

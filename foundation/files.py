@@ -14,7 +14,7 @@ from typing import TextIO
 from thermostand.foundation.errors import SessionError
 
 
-def unreadable(path: Path | str, error: OSError | UnicodeDecodeError) -> str:
+def describe_unreadable(path: Path | str, error: OSError | UnicodeDecodeError) -> str:
     """Why the text file there cannot be read, as `path: sentence`."""
     if isinstance(error, UnicodeDecodeError):
         line = error.object[: error.start].count(b"\n") + 1
@@ -28,12 +28,12 @@ def replace_file(path: Path, data: bytes) -> None:
     """`data` as the file `path`, complete and on the disk when this returns, also when others write one of that name at
     the same time; its folder is made. Raises OSError, and then a file that was there before is unchanged."""
     make_durable_folder(path.parent)
-    temporary = _beside(path)
+    temporary = _create_temporary(path)
     try:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
-            _placed(file.fileno(), temporary, path)
+            _move_into_place(file.fileno(), temporary, path)
     except BaseException:
         with suppress(OSError):
             temporary.unlink()
@@ -41,39 +41,39 @@ def replace_file(path: Path, data: bytes) -> None:
     sync_folder(path.parent)
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_atomically(path: Path, text: str) -> None:
     """Write the text beside the place, then rename; SessionError when refused."""
-    with whole_file(path) as file:
+    with open_atomic(path) as file:
         file.write(text)
 
 
-def write_whole_bytes(path: Path, data: bytes) -> None:
-    """As `write_whole`, for what is no text."""
+def write_bytes_atomically(path: Path, data: bytes) -> None:
+    """As `write_atomically`, for what is no text."""
     _check_place(path)
     try:
         replace_file(path, data)
     except OSError as error:
-        raise _refused(path, error) from error
+        raise _make_refusal(path, error) from error
 
 
 @contextmanager
-def whole_file(path: Path) -> Generator[TextIO]:
+def open_atomic(path: Path) -> Generator[TextIO]:
     """A text file (UTF-8, line ends as written) that takes its place when the block ends well.
 
     Until then, and for good when the block raises, an older file stays as it was and nothing else is left behind.
     SessionError when the place refuses.
     """
     _check_place(path)
-    temporary = _temporary(path)
+    temporary = _name_temporary(path)
     try:
         with temporary.open("w", encoding="utf-8", newline="") as file:
             yield file
             file.flush()
             _check_place(path)
-            _placed(file.fileno(), temporary, path)
+            _move_into_place(file.fileno(), temporary, path)
         sync_folder(path.parent)
     except OSError as error:
-        raise _refused(path, error) from error
+        raise _make_refusal(path, error) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -81,7 +81,7 @@ def whole_file(path: Path) -> Generator[TextIO]:
 def check_writable(path: Path) -> None:
     """SessionError when nothing could be written to `path`: to be raised before the work, not after it."""
     _check_place(path)
-    _temporary(path).unlink()
+    _name_temporary(path).unlink()
 
 
 def make_durable_folder(path: Path) -> None:
@@ -122,40 +122,40 @@ def _check_place(path: Path) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise _refused(path, error) from error
+        raise _make_refusal(path, error) from error
     if stat.S_ISDIR(mode):
         raise SessionError(f"{path}: cannot be written (it is a folder)")
     if not stat.S_ISREG(mode):
         raise SessionError(f"{path}: cannot be written (it is not a regular file)")
 
 
-def _temporary(path: Path) -> Path:
+def _name_temporary(path: Path) -> Path:
     try:
-        return _beside(path)
+        return _create_temporary(path)
     except OSError as error:
-        raise _refused(path, error) from error
+        raise _make_refusal(path, error) from error
 
 
-def _beside(path: Path) -> Path:
+def _create_temporary(path: Path) -> Path:
     """A new file in the same folder, under a unique name."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
     return Path(name)
 
 
-def _placed(fd: int, temporary: Path, path: Path) -> None:
+def _move_into_place(fd: int, temporary: Path, path: Path) -> None:
     """What was written is on the disk, and then under its name."""
     os.fchmod(fd, 0o644)
     os.fsync(fd)
     temporary.replace(path)
 
 
-def _refused(path: Path, error: OSError) -> SessionError:
+def _make_refusal(path: Path, error: OSError) -> SessionError:
     return SessionError(f"{path}: cannot be written ({error.strerror})")
 
 
 @contextmanager
-def new_folder(out: Path) -> Generator[Path]:
+def create_folder(out: Path) -> Generator[Path]:
     """A folder beside `out` (`NAME.part`) to write into. When the block ends well it is on the disk and becomes `out`;
     when it does not, it is removed. SessionError when `out` exists or the disk refuses."""
     part = out.parent / f"{out.name}.part"

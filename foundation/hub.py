@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Quality, Reading
-from thermostand.foundation.repeats import RepeatLimit
+from thermostand.foundation.repeat_limit import RepeatLimit
 
 Subscriber = Callable[[Item], None]
 
@@ -36,7 +36,7 @@ class Hub:
     def publish(self, item: Item) -> None:
         """Remember the readings of a batch, then hand the item on."""
         if isinstance(item, Batch):
-            for event in self._limit.due(item.time_ns) if self._limit is not None else ():
+            for event in self._limit.pop_due(item.time_ns) if self._limit is not None else ():
                 self._hand_on(event)
             for reading in item.readings:
                 self._latest[reading.channel] = reading

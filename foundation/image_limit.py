@@ -13,7 +13,7 @@ _greatest_megapixels = ContextVar("greatest_megapixels", default=GREATEST_MEGAPI
 
 
 @contextmanager
-def images_up_to(megapixels: float) -> Generator[None]:
+def allow_images_up_to(megapixels: float) -> Generator[None]:
     """Inside, images of so many million pixels are read."""
     before = _greatest_megapixels.set(megapixels)
     try:
@@ -22,7 +22,7 @@ def images_up_to(megapixels: float) -> Generator[None]:
         _greatest_megapixels.reset(before)
 
 
-def size_fault(width_px: int, height_px: int) -> str:
+def describe_size_fault(width_px: int, height_px: int) -> str:
     """What is wrong with an image of that size, "" when it can be read."""
     greatest = _greatest_megapixels.get()
     if width_px > 0 and height_px > 0 and width_px * height_px <= greatest * 1e6:

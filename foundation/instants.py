@@ -15,35 +15,35 @@ _LAST_NS = (datetime.max.replace(tzinfo=UTC) - _EPOCH) // timedelta(microseconds
 _OFFSET = re.compile(r"\+(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
 
-def date_time(time_ns: int) -> str:
+def format_date_time(time_ns: int) -> str:
     """`2026-01-01 19:00:04`, local time to the second below; for columns whose head says so."""
-    return f"{_local(time_ns):%Y-%m-%d %H:%M:%S}"
+    return f"{_to_local(time_ns):%Y-%m-%d %H:%M:%S}"
 
 
-def local_text(time_ns: int) -> str:
+def format_local(time_ns: int) -> str:
     """`2026-01-01 19:00:04 CET`: local time with its zone."""
-    return f"{_local(time_ns):%Y-%m-%d %H:%M:%S %Z}"
+    return f"{_to_local(time_ns):%Y-%m-%d %H:%M:%S %Z}"
 
 
-def utc_text(time_ns: int) -> str:
+def format_utc(time_ns: int) -> str:
     """ISO 8601 to the ns, which datetime does not have: `2026-01-01T18:00:00.123456789Z`."""
-    return f"{_datetime(time_ns):%Y-%m-%dT%H:%M:%S}.{time_ns % _NS_PER_S:09d}Z"
+    return f"{_to_datetime(time_ns):%Y-%m-%dT%H:%M:%S}.{time_ns % _NS_PER_S:09d}Z"
 
 
-def _datetime(time_ns: int) -> datetime:
+def _to_datetime(time_ns: int) -> datetime:
     return _EPOCH + timedelta(microseconds=time_ns // _NS_PER_US)
 
 
-def _local(time_ns: int) -> datetime:
+def _to_local(time_ns: int) -> datetime:
     """In the host's zone; UTC where that zone has no such instant."""
-    instant = _datetime(time_ns)
+    instant = _to_datetime(time_ns)
     try:
         return instant.astimezone()
     except (OverflowError, ValueError, OSError):
         return instant
 
 
-def duration(length_ns: int) -> str:
+def format_duration(length_ns: int) -> str:
     """`16:12:33`, with the days before it when there are any; below a minute in seconds, `4.2 s`."""
     if length_ns < 60 * _NS_PER_S:
         return f"{length_ns / _NS_PER_S:.1f} s"
@@ -54,13 +54,13 @@ def parse_instant(text: str, begin_ns: int, stand_ns: Callable[[int], int] = int
     """ns since the epoch on the stand's clock, from an ISO time (local when it names no zone), which `stand_ns`
     converts, or from `+90`, `+1h30m`, `+2m5.5s` after `begin_ns`; ConfigError when it is neither, or no year has it
     that an instant can be written in."""
-    time_ns = _parsed(text, begin_ns, stand_ns)
+    time_ns = _parse(text, begin_ns, stand_ns)
     if not 0 <= time_ns <= _LAST_NS:
         raise ConfigError(f"{text}: is not between the years 1970 and 9999")
     return time_ns
 
 
-def _parsed(text: str, begin_ns: int, stand_ns: Callable[[int], int]) -> int:
+def _parse(text: str, begin_ns: int, stand_ns: Callable[[int], int]) -> int:
     offset = _OFFSET.fullmatch(text)
     if offset is not None and any(offset.groups()):
         hours, minutes, seconds = (float(group or 0) for group in offset.groups())

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def take(path: Path, content: bytes, mode: int = 0o600) -> int | None:
+def take_lock(path: Path, content: bytes, mode: int = 0o600) -> int | None:
     """The descriptor of the file at `path`, locked and with this content; None when a living process has it locked.
     What a dead one left is taken over. mode: of a file that is made. Raises OSError."""
     while True:
@@ -29,7 +29,7 @@ def take(path: Path, content: bytes, mode: int = 0o600) -> int | None:
         os.close(file)  # it was removed between opening and locking
 
 
-def remove(path: Path, file: int) -> None:
+def release_lock(path: Path, file: int) -> None:
     """Remove and unlock what `take` has given, unless another process has the name by now."""
     with suppress(OSError):
         if is_at(file, path):

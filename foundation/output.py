@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import typer
 
-from thermostand.foundation.json_values import plain
-from thermostand.foundation.usage import answer, one_line
+from thermostand.foundation.json_values import make_plain
+from thermostand.foundation.usage import escape_line, get_answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,16 +27,16 @@ class Output:
 _OUTPUT: ContextVar[Output] = ContextVar("output", default=Output())  # noqa: B039 - it is immutable
 
 
-def output() -> Output:
+def get_output() -> Output:
     """What the command under way was asked for. In a thread of one's own: the defaults."""
     return _OUTPUT.get()
 
 
 @contextmanager
-def outputting(wanted: Output) -> Generator[None]:
+def set_output(wanted: Output) -> Generator[None]:
     """`output()` gives this inside."""
     before = _OUTPUT.set(wanted)
-    answer().wanted = wanted.as_json
+    get_answer().wanted = wanted.as_json
     try:
         yield
     finally:
@@ -46,9 +46,9 @@ def outputting(wanted: Output) -> Generator[None]:
 def show(data: object, lines: Iterable[object]) -> None:
     """The result of a command: `data` (values of JSON, dataclasses, arrays; what else there is as text; NaN and
     infinities as null), or the lines."""
-    if output().as_json:
-        answer().is_given = True
-        typer.echo(json.dumps(plain(data), indent=2, default=str))
+    if get_output().as_json:
+        get_answer().is_given = True
+        typer.echo(json.dumps(make_plain(data), indent=2, default=str))
         return
     for line in lines:
         typer.echo(line)
@@ -56,10 +56,10 @@ def show(data: object, lines: Iterable[object]) -> None:
 
 def json_line(data: object) -> str:
     """Of what goes on, for programs: as `show` has it, in one line."""
-    return json.dumps(plain(data), default=str)
+    return json.dumps(make_plain(data), default=str)
 
 
 def say(line: object) -> None:
     """What goes on, in one line on standard error; nothing when quiet."""
-    if not output().quiet:
-        typer.echo(one_line(line), err=True)
+    if not get_output().quiet:
+        typer.echo(escape_line(line), err=True)

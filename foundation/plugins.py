@@ -9,13 +9,13 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticCustomError
 
-from thermostand.foundation.document_faults import path_text, words
+from thermostand.foundation.document_faults import describe_fault, format_path
 from thermostand.foundation.errors import ConfigError
 
 Row = TypeVar("Row")
 
 
-def package_of(point: EntryPoint) -> str:
+def get_package(point: EntryPoint) -> str:
     """The package that adds it, and its version, as in `acme-lamp 1.0`."""
     return point.value if point.dist is None else f"{point.dist.name} {point.dist.version}"
 
@@ -26,7 +26,7 @@ def load_point(point: EntryPoint) -> Any:
         return point.load()
     except Exception as error:  # importing a stranger's module may raise anything
         raise ConfigError(
-            f"{point.name}: {package_of(point)} cannot be loaded ({describe(error)}); reinstall it"
+            f"{point.name}: {get_package(point)} cannot be loaded ({describe(error)}); reinstall it"
         ) from error
 
 
@@ -42,7 +42,7 @@ def load_row(group: str, name: str, row: type[Row], what: str) -> Row:
         found = load_point(point)
         if not isinstance(found, row) or getattr(found, "name", "") != name:
             raise ConfigError(
-                f"{name}: {package_of(point)} has no {row.__name__} of that name there; correct the package"
+                f"{name}: {get_package(point)} has no {row.__name__} of that name there; correct the package"
             )
         return found
     known = ", ".join(sorted({point.name for point in entry_points(group=group)})) or "none installed"
@@ -54,5 +54,5 @@ def check_settings(settings: type[BaseModel], given: Mapping[str, object]) -> Ba
     try:
         return settings.model_validate(given)
     except ValidationError as error:
-        faults = (f"{path_text(each['loc'])}: {words(each)}" for each in error.errors())
+        faults = (f"{format_path(each['loc'])}: {describe_fault(each)}" for each in error.errors())
         raise PydanticCustomError("added", "{text}", {"text": "; ".join(faults)}) from error

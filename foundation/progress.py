@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn,
 from rich.text import Text
 
 from thermostand.foundation.clock import NS_PER_S, WallClock
-from thermostand.foundation.output import output
+from thermostand.foundation.output import get_output
 
 # Plain output: a line each time this share of the work is done, so that a log stays readable.
 _PLAIN_STEP = 0.1
@@ -31,32 +31,32 @@ class Report(Protocol):
 @contextmanager
 def progress(title: str, total: float) -> Generator[Report]:
     """Show progress of `title` on standard error while inside; `total` in any unit."""
-    if output().quiet:
+    if get_output().quiet:
         yield lambda done, text: None
     elif sys.stderr.isatty():
-        with _bar(title, total) as report:
+        with _show_bar(title, total) as report:
             yield report
     else:
         yield _PlainLines(title, total)
 
 
 @contextmanager
-def unwatched(title: str, total: float) -> Generator[Report]:
+def hide_progress(title: str, total: float) -> Generator[Report]:
     """As `progress`, but shows nothing."""
     yield lambda done, text: None
 
 
 @contextmanager
-def late_progress(title: str, total: float) -> Generator[Report]:
+def show_late_progress(title: str, total: float) -> Generator[Report]:
     """As `progress`, but shown only once the work has taken a while."""
-    if output().quiet:
+    if get_output().quiet:
         yield lambda done, text: None
         return
     with ExitStack() as stack:
-        yield _Late(title, total, stack)
+        yield _LateProgress(title, total, stack)
 
 
-class _Late:
+class _LateProgress:
     def __init__(self, title: str, total: float, stack: ExitStack) -> None:
         self._title = title
         self._total = total
@@ -71,12 +71,12 @@ class _Late:
             if self._clock.now_ns() - self._start_ns < _LATE_NS:
                 return
             is_seen = sys.stderr.isatty()
-            self._report = self._stack.enter_context(_bar(self._title, self._total)) if is_seen else self._plain
+            self._report = self._stack.enter_context(_show_bar(self._title, self._total)) if is_seen else self._plain
         self._report(done, text)
 
 
 @contextmanager
-def _bar(title: str, total: float) -> Generator[Report]:
+def _show_bar(title: str, total: float) -> Generator[Report]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -100,10 +100,10 @@ class _WallTimeLeft(ProgressColumn):
     """As the plain lines have it, from the pace of the whole; Rich's own looks back 30 s and is blank in a soak."""
 
     def render(self, task: Task) -> Text:
-        return Text(_left_text(task.elapsed or 0.0, task.percentage / 100.0), style="progress.remaining")
+        return Text(_format_time_left(task.elapsed or 0.0, task.percentage / 100.0), style="progress.remaining")
 
 
-def _left_text(elapsed_s: float, share: float) -> str:
+def _format_time_left(elapsed_s: float, share: float) -> str:
     """Wall time left at the pace so far; unknown before anything is done."""
     if share <= 0.0:
         return "-:--:--"
@@ -127,5 +127,5 @@ class _PlainLines:
         while self._next <= share + 1e-9:
             self._next += _PLAIN_STEP
         elapsed_s = (self._clock.now_ns() - self._start_ns) / NS_PER_S
-        left = _left_text(elapsed_s, share)
+        left = _format_time_left(elapsed_s, share)
         print(f"{self._title}: {min(share, 1.0):4.0%}  {left} left  {text}", file=sys.stderr, flush=True)  # noqa: T201

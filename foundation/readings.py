@@ -64,7 +64,7 @@ def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause
     return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause=cause)
 
 
-TEMPERATURE_IN_DOUBT = "temperature_in_doubt"
+TEMPERATURE_SUSPECT = "temperature_in_doubt"
 """The flag of a frame whose camera temperature is not to be believed."""
 UNSETTLED = "unsettled"
 """The flag of a frame before which the chamber was not in its band at the end of the soak."""

@@ -15,16 +15,16 @@ _HEAD = b'{"crc32": "%08x",\n'
 def seal(kind: str, text: str) -> bytes:
     """The file's content; `text` is a JSON object with a field at least."""
     body = text.strip().removeprefix("{").lstrip().encode() + b"\n"
-    return _HEAD % _crc(kind, body) + body
+    return _HEAD % _compute_crc(kind, body) + body
 
 
 def unseal(kind: str, data: bytes) -> bytes:
     """The JSON object; ValueError when the file is not as `seal` made it."""
     head, _, body = data.partition(b"\n")
-    if head + b"\n" != _HEAD % _crc(kind, body):
+    if head + b"\n" != _HEAD % _compute_crc(kind, body):
         raise ValueError("it is damaged: its checksum is wrong")
     return b"{" + body
 
 
-def _crc(kind: str, body: bytes) -> int:
+def _compute_crc(kind: str, body: bytes) -> int:
     return zlib.crc32(body, zlib.crc32(kind.encode()))

@@ -9,21 +9,21 @@ from typing import Any, TypeVar
 Result = TypeVar("Result")
 
 
-async def watched(work: Coroutine[None, None, Result], background: Sequence[asyncio.Task[None]]) -> Result:
+async def run_with_background(work: Coroutine[None, None, Result], background: Sequence[asyncio.Task[None]]) -> Result:
     """What `work` returns; raises at once what a background task raises: without time or polls nothing would wake it.
 
     On any other way out than its own, `work` has ended before this returns.
     """
     task = asyncio.create_task(work)
     try:
-        await _done(task, set(background))
+        await _wait_until_done(task, set(background))
         return await task
     finally:
-        await cancelled([task])
+        await cancel_all([task])
         del task  # its exception's traceback holds this frame: a cycle that would keep every device alive for a while
 
 
-async def _done(task: asyncio.Task[Any], pending: set[asyncio.Task[None]]) -> None:
+async def _wait_until_done(task: asyncio.Task[Any], pending: set[asyncio.Task[None]]) -> None:
     while not task.done():
         done, _ = await asyncio.wait({task, *pending}, return_when=asyncio.FIRST_COMPLETED)
         for finished in pending & done:
@@ -31,14 +31,14 @@ async def _done(task: asyncio.Task[Any], pending: set[asyncio.Task[None]]) -> No
             finished.result()
 
 
-async def cancelled(tasks: Sequence[asyncio.Task[Any]]) -> None:
+async def cancel_all(tasks: Sequence[asyncio.Task[Any]]) -> None:
     """Cancel them and return when all have ended, whichever way."""
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def first_of(*waits: Coroutine[Any, Any, object]) -> int:
+async def wait_for_first(*waits: Coroutine[Any, Any, object]) -> int:
     """Until the first of these is over, which has this place among them; the others are cancelled. What it raised is
     not raised here."""
     tasks = [asyncio.ensure_future(wait) for wait in waits]
@@ -50,15 +50,15 @@ async def first_of(*waits: Coroutine[Any, Any, object]) -> int:
             task.cancel()
 
 
-def cause_of(error: BaseException) -> BaseException:
+def find_cause(error: BaseException) -> BaseException:
     """What has really gone wrong: of a group of errors the first, but a lack of memory before all others."""
     if not isinstance(error, BaseExceptionGroup):
         return error
-    leaves = [cause_of(each) for each in error.exceptions]
+    leaves = [find_cause(each) for each in error.exceptions]
     return next((leaf for leaf in leaves if isinstance(leaf, MemoryError)), leaves[0])
 
 
-def failure_text(error: BaseException) -> str:
+def describe_failure(error: BaseException) -> str:
     """The error as words for an operator."""
     if isinstance(error, MemoryError):
         return "out of memory"

@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
-from thermostand.foundation.version import installed_version
+from thermostand.foundation.version import read_version
 
 _BAD_INPUT, _INTERRUPTED = 2, 130  # of exit_codes, which imports this module
 
@@ -35,7 +35,7 @@ class Answer:
 _ANSWER: ContextVar[Answer | None] = ContextVar("answer", default=None)
 
 
-def answer() -> Answer:
+def get_answer() -> Answer:
     """Of the command under way."""
     found = _ANSWER.get()
     if found is None:
@@ -53,23 +53,23 @@ class OneLineUsage(TyperGroup):
             _ANSWER.set(Answer("--json" in options))
         if not args:
             return super().make_context(info_name, args, *rest, **extra)
-        with _usage_in_one_line():
+        with _report_usage_errors():
             return super().make_context(info_name, args, *rest, **extra)
 
     def invoke(self, ctx: Any) -> Any:
         """Parse and run the subcommand."""
-        with _usage_in_one_line():
+        with _report_usage_errors():
             return super().invoke(ctx)
 
 
-class Lazy(NamedTuple):
+class LazyCommand(NamedTuple):
     """Where a command is: the module whose `app` holds it, or is it, and its line in the list of commands."""
 
     module: str
     help: str
 
 
-def lazy_app(help_text: str, commands: Mapping[str, Lazy], *, has_completion: bool = False) -> typer.Typer:
+def make_lazy_app(help_text: str, commands: Mapping[str, LazyCommand], *, has_completion: bool = False) -> typer.Typer:
     """A command line whose commands are listed without being imported: their libraries take seconds. has_completion:
     of a program, whose shell may complete its commands and their options."""
 
@@ -82,7 +82,7 @@ def lazy_app(help_text: str, commands: Mapping[str, Lazy], *, has_completion: bo
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             if args and args[0] in commands:
-                self.commands[args[0]] = _imported(commands[args[0]].module, args[0])
+                self.commands[args[0]] = _import_command(commands[args[0]].module, args[0])
             return super().resolve_command(ctx, args)
 
     app = typer.Typer(cls=Commands, no_args_is_help=True, add_completion=has_completion, help=help_text)
@@ -93,7 +93,7 @@ def lazy_app(help_text: str, commands: Mapping[str, Lazy], *, has_completion: bo
 def show_version(asked: bool) -> None:
     """The callback of --version."""
     if asked:
-        typer.echo(f"thermostand {installed_version()}")
+        typer.echo(f"thermostand {read_version()}")
         raise typer.Exit
 
 
@@ -106,7 +106,7 @@ def _root(version: VersionOption = False) -> None:
     """What both command lines take before a command."""
 
 
-def _imported(module: str, name: str) -> Any:
+def _import_command(module: str, name: str) -> Any:
     """The command of that name; the whole group when the module has none of that name.
 
     NumPy and SciPy, which it may import, compute with one thread unless the environment says otherwise: their matrices
@@ -121,47 +121,47 @@ def _imported(module: str, name: str) -> Any:
         # Imported when given: all of it took 1.5 to 1.9 s, which `stand stop` should not take.
         group = get_group(importlib.import_module(module).app)
     except KeyboardInterrupt as error:
-        raise ended("interrupted; nothing was started", _INTERRUPTED) from error
+        raise report_end("interrupted; nothing was started", _INTERRUPTED) from error
     return group.commands.get(name, group)
 
 
 @contextmanager
-def _usage_in_one_line() -> Generator[None]:
+def _report_usage_errors() -> Generator[None]:
     try:
         yield
     except _UsageError as error:
         if not error.format_message():  # it has shown its help
             raise typer.Exit(_BAD_INPUT) from error
-        raise failed(error.format_message(), _BAD_INPUT) from error
+        raise report_failure(error.format_message(), _BAD_INPUT) from error
 
 
-def failed(sentence: object, status: int) -> typer.Exit:
+def report_failure(sentence: object, status: int) -> typer.Exit:
     """To be raised: the program ends with this status. `error: sentence` is on standard error by then, and with --json
     a document with both on standard output, unless that has the result already."""
-    tell(sentence)
-    return _answered(sentence, status)
+    print_error(sentence)
+    return _report_status(sentence, status)
 
 
-def ended(sentence: object, status: int) -> typer.Exit:
+def report_end(sentence: object, status: int) -> typer.Exit:
     """As `failed`, of what is nobody's error."""
-    typer.echo(one_line(sentence), err=True)
-    return _answered(sentence, status)
+    typer.echo(escape_line(sentence), err=True)
+    return _report_status(sentence, status)
 
 
-def tell(sentence: object) -> None:
+def print_error(sentence: object) -> None:
     """`error: sentence` on standard error."""
-    typer.echo(f"error: {one_line(sentence)}", err=True)
+    typer.echo(f"error: {escape_line(sentence)}", err=True)
 
 
-def _answered(sentence: object, status: int) -> typer.Exit:
-    asked = answer()
+def _report_status(sentence: object, status: int) -> typer.Exit:
+    asked = get_answer()
     if asked.wanted and not asked.is_given:
         asked.is_given = True
         typer.echo(json.dumps({"error": str(sentence), "exit_status": status}))
     return typer.Exit(status)
 
 
-def one_line(sentence: object) -> str:
+def escape_line(sentence: object) -> str:
     """The text with line ends, and what else cannot be printed, as escapes: a file's name may hold anything."""
     text = str(sentence)
     if text.isprintable():

@@ -10,7 +10,7 @@ from contextlib import suppress
 _INFO = re.compile(r"thermostand-(.+)\.dist-info")
 
 
-def installed_version() -> str:
+def read_version() -> str:
     """From the name of the folder that says what is installed; importlib.metadata, which takes as long to import as all
     that lists sessions, is asked when there is none, or there are several."""
     found: set[str] = set()

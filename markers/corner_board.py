@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from thermostand.foundation.documents import Document, load_document, read_document
 from thermostand.foundation.errors import DetectionError
-from thermostand.markers.noise import Image, full_scale_DN
+from thermostand.markers.noise import Image, find_full_scale_DN
 
 # AprilGrids as Kalibr prints them: tags with a border of two bits, a black square at each of their corners.
 #
@@ -52,10 +52,10 @@ class AprilGrid(Document):
     flatness_mm: Positive = 0.05
 
     @model_validator(mode="after")
-    def _consistent(self) -> AprilGrid:
+    def _check_consistent(self) -> AprilGrid:
         if not isinstance(getattr(cv2.aruco, self.dictionary, None), int):
             raise ValueError(f"OpenCV has no dictionary {self.dictionary}: it is one like DICT_APRILTAG_36h11")
-        tags = len(_dictionary(self).bytesList)
+        tags = len(_load_dictionary(self).bytesList)
         if self.first_id + self.columns * self.rows > tags:
             raise ValueError(
                 f"{self.dictionary} has {tags} tags, the grid {self.columns * self.rows} from {self.first_id} on"
@@ -88,33 +88,33 @@ def find_tag_corners(grey: cv2.typing.MatLike, grid: AprilGrid) -> Float | None:
     """Corners (N, 2), px, in the order of `coordinates_mm`, NaN where not seen; None when fewer than four tags are."""
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = _BORDER_BITS
-    found, ids, _ = cv2.aruco.ArucoDetector(_dictionary(grid), settings).detectMarkers(grey)
+    found, ids, _ = cv2.aruco.ArucoDetector(_load_dictionary(grid), settings).detectMarkers(grey)
     if np.ndim(ids) == 0 or not np.size(ids):
         return None
     number = np.asarray(ids, np.intp).ravel() - grid.first_id
     ours = (number >= 0) & (number < grid.columns * grid.rows)
     quads, number = np.asarray(found, np.float64).reshape(-1, 4, 2)[ours], number[ours]
-    placed = _placed(quads, number, grid)
+    placed = _assign_corners(quads, number, grid)
     if placed is None:
         return None
     seen = np.isfinite(placed[:, 0])
-    placed[seen] = _refined(grey, placed[seen], grid)
+    placed[seen] = _refine_corners(grey, placed[seen], grid)
     return placed
 
 
-def _placed(quads: Float, number: NDArray[np.intp], grid: AprilGrid) -> Float | None:
+def _assign_corners(quads: Float, number: NDArray[np.intp], grid: AprilGrid) -> Float | None:
     """Each tag's corners (K, 4, 2), px, in their places among the grid's, by a plane through the tags' middles."""
     middles = grid.tags_mm()[number] + grid.tag_mm / 2
     if len(quads) < _LEAST_TAGS:
         return None
-    plane, _ = cv2.findHomography(middles, quads.mean(axis=1), cv2.RANSAC, 0.1 * _side_px(quads))
+    plane, _ = cv2.findHomography(middles, quads.mean(axis=1), cv2.RANSAC, 0.1 * _find_shortest_side_px(quads))
     if np.shape(plane) != (3, 3) or not np.isfinite(plane).all():
         return None
     places = grid.coordinates_mm().reshape(-1, 4, 2)[number]
     expected = cv2.perspectiveTransform(places.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
     apart = np.linalg.norm(expected[:, :, None] - quads[:, None], axis=3)
     nearest = apart.argmin(axis=2)
-    near = (apart.min(axis=2) < _NEAR * _side_px(quads)).all(axis=1)
+    near = (apart.min(axis=2) < _NEAR * _find_shortest_side_px(quads)).all(axis=1)
     once = (np.sort(nearest, axis=1) == np.arange(4)).all(axis=1) & near
     if np.count_nonzero(once) < _LEAST_TAGS:
         return None
@@ -123,21 +123,21 @@ def _placed(quads: Float, number: NDArray[np.intp], grid: AprilGrid) -> Float | 
     return corners.reshape(-1, 2)
 
 
-def _refined(grey: cv2.typing.MatLike, rough: Float, grid: AprilGrid) -> Float:
+def _refine_corners(grey: cv2.typing.MatLike, rough: Float, grid: AprilGrid) -> Float:
     """The corners to a part of a pixel: black touches black there, as in a checkerboard."""
-    side = _side_px(rough.reshape(-1, 4, 2))
+    side = _find_shortest_side_px(rough.reshape(-1, 4, 2))
     half = int(np.clip(0.3 * side * min(grid.gap_mm / grid.tag_mm, 1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
     fine = cv2.cornerSubPix(grey, rough.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return np.asarray(fine, np.float64).reshape(-1, 2)
 
 
-def _side_px(quads: Float) -> float:
+def _find_shortest_side_px(quads: Float) -> float:
     """The shortest side of any tag."""
     return float(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min())
 
 
-def _dictionary(grid: AprilGrid) -> cv2.aruco.Dictionary:
+def _load_dictionary(grid: AprilGrid) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, grid.dictionary))
 
 
@@ -162,7 +162,7 @@ class CornerBoard(Document):
     flatness_mm: Positive = 0.05
 
     @model_validator(mode="after")
-    def _consistent(self) -> CornerBoard:
+    def _check_consistent(self) -> CornerBoard:
         is_charuco = self.kind == "charuco"
         if is_charuco != (self.marker_mm is not None) or is_charuco != (self.dictionary is not None):
             raise ValueError("a charuco board has marker_mm and dictionary, a checkerboard neither")
@@ -209,17 +209,17 @@ def load_corner_board(path: Path) -> BoardOfCorners | None:
 def find_corners(image: Image, board: BoardOfCorners) -> Float:
     """Corners (N, 2), px, in the order of `coordinates_mm`, NaN where not seen. Raises DetectionError when there are
     none."""
-    grey = image if image.dtype == np.uint8 else cv2.convertScaleAbs(image, alpha=255 / full_scale_DN(image))
+    grey = image if image.dtype == np.uint8 else cv2.convertScaleAbs(image, alpha=255 / find_full_scale_DN(image))
     if isinstance(board, AprilGrid):
         found = find_tag_corners(grey, board)
     else:
-        found = _checkerboard(grey, board) if board.kind == "checkerboard" else _charuco(grey, board)
+        found = _find_checkerboard(grey, board) if board.kind == "checkerboard" else _find_charuco(grey, board)
     if found is None:
         raise DetectionError(f"the {board.columns} x {board.rows} {board.kind} {board.name} was not found")
     return found
 
 
-def _checkerboard(grey: cv2.typing.MatLike, board: CornerBoard) -> Float | None:
+def _find_checkerboard(grey: cv2.typing.MatLike, board: CornerBoard) -> Float | None:
     size = (board.columns - 1, board.rows - 1)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     success, corners = cv2.findChessboardCorners(grey, size, flags=flags)
@@ -233,7 +233,7 @@ def _checkerboard(grey: cv2.typing.MatLike, board: CornerBoard) -> Float | None:
     return np.asarray(fine, np.float64).reshape(-1, 2)
 
 
-def _charuco(grey: cv2.typing.MatLike, board: CornerBoard) -> Float | None:
+def _find_charuco(grey: cv2.typing.MatLike, board: CornerBoard) -> Float | None:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(board.dictionary)))
     pattern = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.square_mm, float(board.marker_mm or 0), dictionary

@@ -22,22 +22,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
+from thermostand.markers.candidate_search import Candidates, find_candidates, iterate_disc_sizes_px
 from thermostand.markers.edge_fit import EdgeFit, Flag, fit_edges
 from thermostand.markers.edge_model import B0, CX, CY, F0, M11, M12, M22, PARAMETERS, SIGMA, EdgeState, Float
-from thermostand.markers.grid import (
+from thermostand.markers.grid_identification import (
     DetectionError,
     Identified,
+    compute_pitch_px,
     fit_homography,
     identify,
-    pitch_px,
 )
+from thermostand.markers.homography import predict_px, project
 from thermostand.markers.newton import LEAST_BAND_PX
 from thermostand.markers.noise import Image, Noise
-from thermostand.markers.pixels import Mask, Picture, picture_of
-from thermostand.markers.plane import expected_px, project
+from thermostand.markers.pixels import Mask, Picture, make_picture
 from thermostand.markers.refit import refit_edges
-from thermostand.markers.sandwich import SAMPLED_MARKERS, variance_growth, variance_ratio
+from thermostand.markers.sandwich import SAMPLED_MARKERS, compute_variance_growth, compute_variance_ratio
 from thermostand.markers.target import Target
 
 # How wide a band of pixels round the outlines is fitted, and what its width says about the centres' errors.
@@ -58,22 +58,22 @@ WIDE_SIGMA, NARROW_SIGMA = 9.0, 4.5
 """Half widths of the band in blurs."""
 WIDE_EXCESS = (WIDE_SIGMA / NARROW_SIGMA) ** 2
 # With a limit of 1.4 alone 0.6 % of clean frames were doubtful, but only 56 % of those with JPEG of quality 90.
-_DOUBTFUL_GROWTH, _SUSPECT_GROWTH = 1.4, 1.3
+_GROWTH_LIMIT, _SUSPECT_GROWTH_LIMIT = 1.4, 1.3
 """Along x or y alone, as rows that flicker have it."""
 # With it 1 of 200 frames of noise alone is doubtful, 47 of 48 of JPEG 90 and of JPEG 80, and all of gamma, rows and
 # grain (`python -m tests.bench claimed_variances`). Half of it is 1.4 sigma from noise, and twice above most of JPEG
 # 90.
-_DOUBTFUL_TOGETHER, _SUSPECT_TOGETHER = 0.35, 0.3
+_CORRELATION_LIMIT, _SUSPECT_CORRELATION_LIMIT = 0.35, 0.3
 """Growth along x and y and of the levels' variance: each scatters by itself where there is only noise, and they grow
 together where residuals hang together: 0.05 +- 0.09 by noise alone (54 markers), 0.59 +- 0.12 by JPEG of quality 90."""
-_DOUBTFUL_CHANCES = 3.0  # standard deviations of what chance makes of the sum
-_DOUBTFUL_LEVELS = 1.3
+_CHANCE_SIGMAS = 3.0  # standard deviations of what chance makes of the sum
+_LEVELS_LIMIT = 1.3
 _BEYOND_CHANCE = 1.5
 """Of a mean square over a frame's markers, 54 of them: chance reaches it once in a hundred frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Strangeness:
+class ResidualCorrelation:
     """How much the residuals of a frame hang together, each 0 (levels: 1) where there is noise alone. along: growth of
     variance along x or y, the larger. together: that of x and y, their mean, and of the levels. chance: standard
     deviation of `together`'s first part. levels: root mean square of the sectors' levels. growth: (2,), of the
@@ -85,28 +85,32 @@ class Strangeness:
     chance: float
     levels: float
 
-    def is_doubtful(self) -> bool:
+    def exceeds_noise_model(self) -> bool:
         """Whether what is seen is not what the noise model describes. Of 100 frames of noise alone at most one."""
-        limit = max(_DOUBTFUL_TOGETHER, _DOUBTFUL_CHANCES * self.chance)
-        return self.along > _DOUBTFUL_GROWTH - 1 or self.together > limit or self.levels > _DOUBTFUL_LEVELS
+        limit = max(_CORRELATION_LIMIT, _CHANCE_SIGMAS * self.chance)
+        return self.along > _GROWTH_LIMIT - 1 or self.together > limit or self.levels > _LEVELS_LIMIT
 
     def is_suspect(self) -> bool:
         """Whether it may be doubtful, if this is from a sample of the markers: then it takes all to decide."""
-        return self.along > _SUSPECT_GROWTH - 1 or self.together > _SUSPECT_TOGETHER or self.levels > _DOUBTFUL_LEVELS
+        return (
+            self.along > _SUSPECT_GROWTH_LIMIT - 1
+            or self.together > _SUSPECT_CORRELATION_LIMIT
+            or self.levels > _LEVELS_LIMIT
+        )
 
 
-def strangeness(fit: EdgeFit, clean: NDArray[np.bool_]) -> Strangeness:
+def measure_residual_correlation(fit: EdgeFit, clean: NDArray[np.bool_]) -> ResidualCorrelation:
     """Of the `clean` (N,) markers."""
     if not clean.any():
-        return Strangeness(np.ones(2), 0.0, 0.0, 0.0, 1.0)
+        return ResidualCorrelation(np.ones(2), 0.0, 0.0, 0.0, 1.0)
     levels = float(np.median(fit.levels[clean] / fit.chi[clean]))
-    ratio, chance = variance_ratio(fit.scatter, clean)
-    growth = variance_growth(ratio, chance)
+    ratio, chance = compute_variance_ratio(fit.scatter, clean)
+    growth = compute_variance_growth(ratio, chance)
     together = float(ratio.mean()) - 1 + levels**2 - 1
-    return Strangeness(growth, float(growth.max()) - 1, together, float(np.linalg.norm(chance)) / 2, levels)
+    return ResidualCorrelation(growth, float(growth.max()) - 1, together, float(np.linalg.norm(chance)) / 2, levels)
 
 
-def excess_px2(wide: EdgeFit, narrow: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> Float:
+def compute_excess_px2(wide: EdgeFit, narrow: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> Float:
     """By what the mean squared difference of the centres (x, y) exceeds that of independent noise, px^2, 0 where it may
     be chance. growth: of the wide fit. clean: (N,), markers without a flag in both."""
     if not clean.any():
@@ -128,14 +132,14 @@ _LEAST_PEERS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Implied:
+class PredictedEdges:
     """state: the edges of K markers. spread: (K, 4), standard deviations of their m11, m12, m22 and sigma."""
 
     state: EdgeState
     spread: Float
 
 
-def expected_edges(homography: Float, target: Target) -> EdgeState:
+def project_edges(homography: Float, target: Target) -> EdgeState:
     """The image ellipses of the target's circles, levels unknown (NaN): conic C = H^-T Q H^-1 of each circle Q."""
     x, y = target.coordinates_mm().T
     radius = target.diameters_mm() / 2
@@ -164,9 +168,9 @@ def _require_in_front(homography: Float, centres_mm: Float, radii_mm: Float) -> 
     project(homography, (centres_mm[:, None] + radii_mm[:, None, None] * corners).reshape(-1, 2))
 
 
-def implied_edges(
+def predict_edges(
     state: EdgeState, homography: Float, target: Target, clean: NDArray[np.bool_], which: NDArray[np.intp]
-) -> Implied | None:
+) -> PredictedEdges | None:
     """What the `clean` (N,) markers of `state` say about those numbered `which` (K,), from 0.
 
     Shapes deviate from the homography's ellipses, and blurs from each other, linearly over the target; only markers of
@@ -178,9 +182,9 @@ def implied_edges(
     if not peers or min(np.count_nonzero(group) for group in peers) < _LEAST_PEERS:
         return None
     places = target.coordinates_mm()
-    expected = expected_edges(homography, target)
+    expected = project_edges(homography, target)
     known = np.where(clean[:, None], state.centres_px(), np.nan)
-    expected.parameters[:, [CX, CY]] = expected_px(places, known, homography)
+    expected.parameters[:, [CX, CY]] = predict_px(places, known, homography)
     in_scale = state.parameters[:, M11 : SIGMA + 1].copy()
     in_scale[:, :3] *= ((expected.scale_px / state.scale_px) ** 2)[:, None]
     deviation = in_scale - np.pad(expected.parameters[:, M11:SIGMA], ((0, 0), (0, 1)))
@@ -195,36 +199,36 @@ def implied_edges(
         implied.parameters[row, M11 : SIGMA + 1] += by_peers @ deviation[group]
         nearest = np.flatnonzero(clean)[np.linalg.norm(places[clean] - places[n], axis=1).argmin()]
         implied.parameters[row, B0:] = state.parameters[nearest, B0:]
-    return Implied(implied, spread)
+    return PredictedEdges(implied, spread)
 
 
 # Whether a target is still where the frame before had it, and which rows of the picture it takes to follow it.
 
 _FOLLOWED_PART = 0.9  # of the markers; round number, nothing was measured
 _GREATEST_STEP_PX = 5.0  # drift between two frames is below 0.05 px
-_GLANCE_BLURS = 3.0  # from the outline: beyond it the edge has its full level
-_GLANCE_CONTRAST = 0.75  # of the contrast before; round number, nothing was measured
+_PROBE_BLURS = 3.0  # from the outline: beyond it the edge has its full level
+_PROBE_CONTRAST = 0.75  # of the contrast before; round number, nothing was measured
 _TOWARDS = np.array([[function(k * np.pi / 8) for k in range(16)] for function in (np.cos, np.sin)])
 _TWICE = 2 * _TOWARDS[0] * _TOWARDS[1]
-_ROOM_PX, _ROOM_OF_UNSEEN = 4.0, 0.5
+_MOTION_MARGIN_PX, _UNSEEN_MARGIN_RADII = 4.0, 0.5
 """By what a marker may move, or its band grow, until rows are looked at that were not foreseen; of one that was not
 seen, in radii: the search for it begins in its place and goes further."""
 
 
-def still_there(picture: Picture, state: EdgeState, is_seen: Mask, inwards: Float) -> bool:
+def is_still_in_place(picture: Picture, state: EdgeState, is_seen: Mask, inwards: Float) -> bool:
     """Whether the markers (N,) that were seen still look as they did: a glance at 16 pixels on either side of each
     outline, not nearer to the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere because the
     target has moved."""
     m11, m12, m22 = (state.parameters[:, [each]] for each in (M11, M12, M22))
     radius = state.scale_px[:, None] / np.sqrt(m11 * _TOWARDS[0] ** 2 + m22 * _TOWARDS[1] ** 2 + m12 * _TWICE)
-    margin = np.minimum(_GLANCE_BLURS * state.parameters[:, [SIGMA]], np.minimum(0.6, 1 - inwards) * radius)
+    margin = np.minimum(_PROBE_BLURS * state.parameters[:, [SIGMA]], np.minimum(0.6, 1 - inwards) * radius)
     along = np.stack([radius + margin, radius - margin])
     column, row = (
         np.clip(np.rint(state.parameters[:, [axis]] + along * _TOWARDS[axis]), 0, picture.shape[1 - axis] - 1)
         for axis in (CX, CY)
     )
     levels = picture.values_DN(row.astype(np.intp), column.astype(np.intp)).mean(axis=2)
-    unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _GLANCE_CONTRAST
+    unchanged = (levels[0] - levels[1]) / state.contrast_DN() > _PROBE_CONTRAST
     return bool(unchanged[is_seen].mean() >= _FOLLOWED_PART)
 
 
@@ -236,7 +240,7 @@ def has_followed(now_px: Float, before_px: Float) -> bool:
     return bool(found >= _FOLLOWED_PART * found_before and np.nanmax(moved) < _GREATEST_STEP_PX)
 
 
-def rows_round(state: EdgeState, is_seen: Mask, outwards: Float, band_sigma: float, height: int) -> Mask:
+def find_fit_rows(state: EdgeState, is_seen: Mask, outwards: Float, band_sigma: float, height: int) -> Mask:
     """The rows (height,) that a fit from `state` looks at, in all likelihood: those of each marker's band, which ends
     `outwards` (N,) radii from the centre, and some more."""
     half_px, blur_px, mean_px = state.half_extents_px(), state.parameters[:, SIGMA], state.radii_px()
@@ -244,8 +248,10 @@ def rows_round(state: EdgeState, is_seen: Mask, outwards: Float, band_sigma: flo
     long_px = np.sqrt(0.5 * (squares + np.sqrt(np.maximum(squares**2 - 4 * mean_px**4, 0))))
     width = np.maximum(band_sigma * blur_px, LEAST_BAND_PX) * long_px / mean_px**2
     band_px = half_px[:, 1] * np.minimum(1 + width, outwards)
-    reach_px = np.maximum(band_px, half_px[:, 1] + _GLANCE_BLURS * blur_px)
-    reach_px += np.where(is_seen, _ROOM_PX, np.maximum(_ROOM_OF_UNSEEN * half_px[:, 1], _ROOM_PX))
+    reach_px = np.maximum(band_px, half_px[:, 1] + _PROBE_BLURS * blur_px)
+    reach_px += np.where(
+        is_seen, _MOTION_MARGIN_PX, np.maximum(_UNSEEN_MARGIN_RADII * half_px[:, 1], _MOTION_MARGIN_PX)
+    )
     middle = state.centres_px()[:, 1]
     begins = np.clip(np.floor(middle - reach_px), 0, height).astype(int)
     ends = np.clip(np.ceil(middle + reach_px) + 1, 0, height).astype(int)
@@ -267,19 +273,19 @@ def rows_round(state: EdgeState, is_seen: Mask, outwards: Float, band_sigma: flo
 
 _LEAST_MARKERS = 20
 """So many determine w^2 to a quarter of the variance of r."""
-_BELIEVED_CHI2, _DOUBTED_CHI2 = 2.0, 5.0
+_FULL_WEIGHT_CHI2, _ZERO_WEIGHT_CHI2 = 2.0, 5.0
 """A marker whose slopes differ by more (chi^2 of two) is pulled less and less, and then stays as it is: faint glare
 that no flag shows would gain weight."""
 
 
-def under_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
+def apply_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
     """Centres (N, 2) px and their covariances (N, 2, 2), where the slopes of the `clean` (N,) markers are believed to
     differ no more than the frame shows; the others, and all where they are few, as they were fitted."""
     centres, covariance = fit.state.centres_px().copy(), fit.covariance_px2.copy()
     if np.count_nonzero(clean) < _LEAST_MARKERS:
         return centres, covariance
     state, whole = fit.state[np.flatnonzero(clean)], fit.covariance[clean]
-    by_parameters = _by_parameters(state)
+    by_parameters = _compute_derivatives(state)
     differing = np.einsum("nij,nj->ni", by_parameters, state.parameters)
     shared = whole[:, :2] @ by_parameters.transpose(0, 2, 1)
     variance = by_parameters @ whole @ by_parameters.transpose(0, 2, 1)
@@ -287,13 +293,13 @@ def under_common_light(fit: EdgeFit, clean: NDArray[np.bool_]) -> tuple[Float, F
     inverse = np.linalg.inv(variance + max(float(beyond), 0.0) * np.eye(2))
     gain = shared @ inverse
     chi2 = np.einsum("ni,nij,nj->n", differing, inverse, differing)
-    part = np.clip((_DOUBTED_CHI2 - chi2) / (_DOUBTED_CHI2 - _BELIEVED_CHI2), 0, 1)[:, None]
+    part = np.clip((_ZERO_WEIGHT_CHI2 - chi2) / (_ZERO_WEIGHT_CHI2 - _FULL_WEIGHT_CHI2), 0, 1)[:, None]
     centres[clean] -= part * np.einsum("nij,nj->ni", gain, differing)
     covariance[clean] -= (part * (2 - part))[:, :, None] * (gain @ shared.transpose(0, 2, 1))
     return centres, covariance
 
 
-def _by_parameters(state: EdgeState) -> Float:
+def _compute_derivatives(state: EdgeState) -> Float:
     """The derivatives of r by the parameters (N, 2, 12), but for those by the levels, which are known far better."""
     rows = np.arange(len(state.scale_px))
     ground, disc = state.parameters[:, B0], state.parameters[:, F0]
@@ -314,9 +320,9 @@ __all__ = [
     "Noise",
     "detect",
     "follow",
-    "grey_image",
-    "nothing_found",
-    "rows_to_follow",
+    "convert_to_grey",
+    "make_empty_detection",
+    "predict_rows",
 ]
 
 # In rendered scenes with glare and an occluder all 9 bad markers are above it, and no good one.
@@ -363,7 +369,7 @@ class Detection:
         return int(np.isfinite(self.centres_px[:, 0]).sum())
 
 
-def _unwatched(part: float) -> None:
+def _ignore_progress(part: float) -> None:
     """No progress is shown."""
 
 
@@ -372,7 +378,7 @@ def detect(
     target: Target,
     previous: Detection | None = None,
     noise: Noise | None = None,
-    watch: Callable[[float], None] = _unwatched,
+    watch: Callable[[float], None] = _ignore_progress,
 ) -> Detection:
     """The target's markers in a grey (height, width) or colour (height, width, 3; B G R) image, which is only read.
 
@@ -381,20 +387,20 @@ def detect(
     median marker. watch: gets the part of a search that is done, 0 to 1. Raises DetectionError when the target cannot
     be identified beyond doubt.
     """
-    grey = picture_of(grey_image(image))
+    grey = make_picture(convert_to_grey(image))
     if previous is not None:
         followed = _follow(grey, target, previous, noise)
         if followed is not None:
             return followed
     homography = None if previous is None else previous.homography
-    found = _search(grey_image(image), grey, target, homography, noise, watch)
+    found = _search(convert_to_grey(image), grey, target, homography, noise, watch)
     return replace(found, is_orientation_assumed=target.is_orientation_assumed)
 
 
-def rows_to_follow(previous: Detection, target: Target, height: int) -> Mask:
+def predict_rows(previous: Detection, target: Target, height: int) -> Mask:
     """The rows (height,) of the next frame that `follow` looks at, if all goes on as before."""
-    reach = _reach(target)[:, 1]
-    return rows_round(previous.state, np.isfinite(previous.chi), reach, previous.band_sigma, height)
+    reach = _get_reach(target)[:, 1]
+    return find_fit_rows(previous.state, np.isfinite(previous.chi), reach, previous.band_sigma, height)
 
 
 def follow(
@@ -402,7 +408,7 @@ def follow(
 ) -> Detection | None:
     """What `detect` finds by going on from `previous`, from an image (height, width) of which only `rows` are there.
     None where that takes more of it, or another way, to find out: `detect` does it in the whole image."""
-    picture = picture_of(image, rows)
+    picture = make_picture(image, rows)
     followed = _follow(picture, target, previous, noise)
     return None if picture.missed[0] else followed
 
@@ -410,18 +416,18 @@ def follow(
 def _follow(picture: Picture, target: Target, previous: Detection, noise: Noise | None) -> Detection | None:
     if len(previous.flags) != target.count:
         raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
-    if not still_there(picture, previous.state, np.isfinite(previous.chi), _reach(target)[:, :1]):
+    if not is_still_in_place(picture, previous.state, np.isfinite(previous.chi), _get_reach(target)[:, :1]):
         return None
     sampled = target.count if previous.is_doubtful else SAMPLED_MARKERS
     with suppress(DetectionError):
         tracked = _fit_in_band(picture, target, previous.state, noise, previous.band_sigma, sampled)
         if tracked is not None and has_followed(tracked[0].centres_px, previous.centres_px):
-            found = _doubted(tracked[0], previous.excess_px2)
+            found = _add_excess(tracked[0], previous.excess_px2)
             return replace(found, is_orientation_assumed=target.is_orientation_assumed)
     return None
 
 
-def nothing_found(target: Target) -> Detection:
+def make_empty_detection(target: Target) -> Detection:
     """All markers missing: what an image without the target has instead of a detection."""
     count = target.count
     return Detection(
@@ -438,7 +444,7 @@ def nothing_found(target: Target) -> Detection:
     )
 
 
-def grey_image(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
+def convert_to_grey(image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
     """The image itself when it is grey, else its luminance; raises ValueError for other shapes and types."""
     if image.dtype.name not in ("uint8", "uint16") or image.size == 0:
         raise ValueError(f"an image is uint8 or uint16 and not empty, not {image.dtype} {image.shape}")
@@ -462,13 +468,13 @@ def _search(
 ) -> Detection:
     """Look for the target at every scale it may have; the failure that came nearest is the one reported."""
     nearest: DetectionError | None = None
-    sizes_px = list(disc_sizes_px(target, grey.shape))
+    sizes_px = list(iterate_disc_sizes_px(target, grey.shape))
     for tried, size_px in enumerate(sizes_px):
         watch(tried / len(sizes_px))
         candidates = find_candidates(grey, target, size_px)
         try:
             identified = identify(candidates, target, previous, grey.shape)
-            return _first_fit(picture, target, candidates, identified, noise)
+            return _fit_candidates(picture, target, candidates, identified, noise)
         except DetectionError as error:
             if nearest is None or error.found > nearest.found:
                 nearest = error
@@ -477,11 +483,11 @@ def _search(
     )
 
 
-def _first_fit(
+def _fit_candidates(
     picture: Picture, target: Target, candidates: Candidates, identified: Identified, noise: Noise | None
 ) -> Detection:
     """Fit from the homography's ellipses, put where the candidates are and scaled to the size they have."""
-    start = expected_edges(identified.homography, target)
+    start = project_edges(identified.homography, target)
     seen = identified.candidate >= 0
     areas = candidates.areas_px2[identified.candidate[seen]]
     scale = float(np.median(np.sqrt(areas / np.pi) / start.radii_px()[seen]))
@@ -508,8 +514,8 @@ def _fit(picture: Picture, target: Target, start: EdgeState, noise: Noise | None
     if again is None:
         return wide
     narrow, narrow_fit = again
-    excess = excess_px2(fit, narrow_fit, wide.growth, (wide.flags == 0) & (narrow.flags == 0))
-    possible = _doubted(wide, WIDE_EXCESS * excess), _doubted(narrow, excess)
+    excess = compute_excess_px2(fit, narrow_fit, wide.growth, (wide.flags == 0) & (narrow.flags == 0))
+    possible = _add_excess(wide, WIDE_EXCESS * excess), _add_excess(narrow, excess)
     return min(possible, key=lambda one: float(np.nanmedian(np.trace(one.covariance_px2, axis1=1, axis2=2))))
 
 
@@ -524,36 +530,36 @@ def _fit_in_band(
     """The fit from `start`, judged; None when fewer markers than the target demands have a credible centre. sampled:
     how many markers say whether residuals hang together, at first."""
     model = noise or Noise()
-    fit = fit_edges(picture, start, model, _reach(target), band_sigma, sampled)
+    fit = fit_edges(picture, start, model, _get_reach(target), band_sigma, sampled)
     good = np.isfinite(fit.chi) & _has_contrast(fit.state, target, model)
     if good.sum() < target.least_markers:
         return None
     homography = fit_homography(target.coordinates_mm()[good], fit.state.centres_px()[good])
-    expected = expected_edges(homography, target)
-    placed = good & _in_its_place(fit.state, homography, expected, target, good) & _within_image(fit.state, picture)
+    expected = project_edges(homography, target)
+    placed = good & _is_in_place(fit.state, homography, expected, target, good) & _is_within_image(fit.state, picture)
     if placed.sum() < target.least_markers:
         return None
     if placed.sum() < good.sum():
         homography = fit_homography(target.coordinates_mm()[placed], fit.state.centres_px()[placed])
-        expected = expected_edges(homography, target)
-    detection, strange = _judged(fit, placed, homography, expected, band_sigma, relative=noise is None)
+        expected = project_edges(homography, target)
+    detection, strange = _assess(fit, placed, homography, expected, band_sigma, relative=noise is None)
     if sampled < target.count and strange.is_suspect():
         return _fit_in_band(picture, target, fit.state, noise, band_sigma, target.count)
-    return _refitted(detection, fit, picture, target, model), fit
+    return _refit_poor(detection, fit, picture, target, model), fit
 
 
-def _doubted(detection: Detection, excess: Float) -> Detection:
+def _add_excess(detection: Detection, excess: Float) -> Detection:
     """The detection with `excess` (2,), px^2, added to the variances of its centres. Where there is any, residuals that
     hang together over the whole marker hide from `growth`: below 1 it is not believed."""
     growth = np.where(excess > 0, np.maximum(detection.growth, 1), detection.growth)
-    covariance = _grown(detection.covariance_px2, growth / detection.growth) + np.diag(excess)
+    covariance = _grow_variances(detection.covariance_px2, growth / detection.growth) + np.diag(excess)
     doubtful = detection.is_doubtful or bool(np.any(excess > 0))
     return replace(detection, covariance_px2=covariance, growth=growth, excess_px2=excess, is_doubtful=doubtful)
 
 
-def _judged(
+def _assess(
     fit: EdgeFit, good: NDArray[np.bool_], homography: Float, expected: EdgeState, band_sigma: float, relative: bool
-) -> tuple[Detection, Strangeness]:
+) -> tuple[Detection, ResidualCorrelation]:
     """The detection of a fit whose markers are `good` or missing; missing ones are `expected` where the others say."""
     chi, misfit = np.where(good, fit.chi, np.nan), np.where(good, fit.misfit, np.nan)
     usual = max(float(np.median(fit.chi[good])), 1e-9)
@@ -568,11 +574,11 @@ def _judged(
     parameters = expected.parameters.copy()
     parameters[:, SIGMA:] = np.median(fit.state.parameters[good][:, SIGMA:], axis=0)
     believed = good & ~poor
-    centres, covariance = under_common_light(fit, believed)
-    strange = strangeness(fit, believed)
+    centres, covariance = apply_common_light(fit, believed)
+    strange = measure_residual_correlation(fit, believed)
     found = Detection(
         centres_px=np.where(good[:, None], centres, np.nan),
-        covariance_px2=np.where(good[:, None, None], _grown(covariance, strange.growth), np.nan),
+        covariance_px2=np.where(good[:, None, None], _grow_variances(covariance, strange.growth), np.nan),
         flags=flags.astype(np.uint8),
         chi=chi,
         homography=homography,
@@ -583,21 +589,21 @@ def _judged(
         growth=strange.growth,
         excess_px2=np.zeros(2),
         band_sigma=band_sigma,
-        is_doubtful=strange.is_doubtful(),
+        is_doubtful=strange.exceeds_noise_model(),
     )
     return found, strange
 
 
-def _grown(covariance: Float, growth: Float) -> Float:
+def _grow_variances(covariance: Float, growth: Float) -> Float:
     """Covariances (N, 2, 2) whose variances grow and whose correlations stay."""
     return covariance * np.sqrt(np.outer(growth, growth))
 
 
-def _refitted(detection: Detection, fit: EdgeFit, picture: Picture, target: Target, noise: Noise) -> Detection:
+def _refit_poor(detection: Detection, fit: EdgeFit, picture: Picture, target: Target, noise: Noise) -> Detection:
     """The detection with its poor markers measured again from what looks clean of them, where that is enough."""
     clean = detection.flags == 0
     poor = np.flatnonzero((detection.flags & (Flag.POOR_FIT | Flag.BORDER | Flag.MISSING)) == Flag.POOR_FIT)
-    implied = implied_edges(detection.state, detection.homography, target, clean, poor)
+    implied = predict_edges(detection.state, detection.homography, target, clean, poor)
     if implied is None:
         return detection
     usual = float(np.median(fit.chi[clean]))
@@ -608,7 +614,7 @@ def _refitted(detection: Detection, fit: EdgeFit, picture: Picture, target: Targ
         implied.state,
         implied.spread,
         scaled,
-        _reach(target)[poor],
+        _get_reach(target)[poor],
         patience=patience,
         band_sigma=detection.band_sigma,
     )
@@ -616,7 +622,7 @@ def _refitted(detection: Detection, fit: EdgeFit, picture: Picture, target: Targ
     which = poor[credible]
     for whole, part in (
         (detection.centres_px, again.state.centres_px()),
-        (detection.covariance_px2, _grown(again.covariance_px2, np.maximum(detection.growth, 1))),
+        (detection.covariance_px2, _grow_variances(again.covariance_px2, np.maximum(detection.growth, 1))),
         (detection.chi, again.chi),
         (detection.state.parameters, again.state.parameters),
         (detection.state.scale_px, again.state.scale_px),
@@ -626,7 +632,7 @@ def _refitted(detection: Detection, fit: EdgeFit, picture: Picture, target: Targ
     return detection
 
 
-def _reach_of(target: Target) -> Float:
+def _compute_reach(target: Target) -> Float:
     """Read-only: from where to where, in radii, a marker's pixels lie (N, 2): half way to the nearest other edge."""
     centres, radii = target.coordinates_mm(), target.diameters_mm() / 2
     gap = np.linalg.norm(centres[:, None] - centres[None], axis=2) - radii[:, None] - radii[None]
@@ -637,7 +643,7 @@ def _reach_of(target: Target) -> Float:
     return reach
 
 
-_reach = cast("Callable[[Target], Float]", lru_cache(maxsize=16)(_reach_of))
+_get_reach = cast("Callable[[Target], Float]", lru_cache(maxsize=16)(_compute_reach))
 """The same for each frame of a target."""
 
 
@@ -648,22 +654,22 @@ def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.
     return sign * state.contrast_DN() > _LEAST_CONTRAST_SIGMA * np.sqrt(noise.variance_DN2(level))
 
 
-def _in_its_place(
+def _is_in_place(
     state: EdgeState, homography: Float, expected: EdgeState, target: Target, good: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Whether each ellipse has about the place and the size that the other markers imply."""
-    limit_px = _PLACE_TOLERANCE_PITCH * pitch_px(homography, target)
+    limit_px = _PLACE_TOLERANCE_PITCH * compute_pitch_px(homography, target)
     off_px = np.linalg.norm(state.centres_px() - project(homography, target.coordinates_mm()), axis=1)
     if np.any(off_px[good] > _FLAT_PART * limit_px):  # a wide lens, or a wrong one among them
         known = np.where(good[:, None], state.centres_px(), np.nan)
-        bent_px = expected_px(target.coordinates_mm(), known, homography)
+        bent_px = predict_px(target.coordinates_mm(), known, homography)
         off_px = np.linalg.norm(state.centres_px() - bent_px, axis=1)
     ratio = state.radii_px() / expected.radii_px()
     ratio = ratio / np.median(ratio[good])
     return (off_px < limit_px) & (ratio < _SIZE_TOLERANCE) & (ratio > 1 / _SIZE_TOLERANCE)
 
 
-def _within_image(state: EdgeState, picture: Picture) -> NDArray[np.bool_]:
+def _is_within_image(state: EdgeState, picture: Picture) -> NDArray[np.bool_]:
     """Whether the whole outline is in the image, give or take its blur."""
     height, width = picture.shape
     margin = state.half_extents_px() - state.parameters[:, SIGMA, None]

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from thermostand.foundation.files import whole_file
+from thermostand.foundation.files import open_atomic
 from thermostand.markers.detection import Detection, Flag
-from thermostand.markers.eccentricity import Float, disc_centres
+from thermostand.markers.eccentricity import Float, compute_disc_centres
 from thermostand.markers.target import Target
 
 COLUMNS = (
@@ -25,7 +25,7 @@ COLUMNS = (
 CENTRES = "x_px, y_px: centres of the outlines in the image; disc_x_px, disc_y_px: images of the discs' own centres"
 
 
-def doubt(images: int) -> str:
+def format_noise_warning(images: int) -> str:
     """What is said of so many images whose detections are doubtful."""
     return (
         f"noise alone does not describe {images} image{'s' * (images != 1)} (texture, print, compression, flicker): "
@@ -48,34 +48,34 @@ def write_detections(path: Path, target: Target, images: Iterable[DetectedImage]
     The file appears when it is complete; when writing fails, or `images` raises, an older file stays as it was.
     SessionError when the place cannot be written to.
     """
-    with whole_file(path) as file:
+    with open_atomic(path) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for image in images:
-            writer.writerows(_rows(image, target))
+            writer.writerows(_iterate_rows(image, target))
 
 
-def flags_text(flags: int) -> str:
+def format_flags(flags: int) -> str:
     """`OK`, or the names of the flags joined by `|`."""
     return "|".join(flag.name or "" for flag in Flag(flags)) or "OK"
 
 
-def _rows(image: DetectedImage, target: Target) -> Iterator[tuple[object, ...]]:
+def _iterate_rows(image: DetectedImage, target: Target) -> Iterator[tuple[object, ...]]:
     """The image's rows."""
     found = image.detection
-    discs_px, discs_px2 = disc_centres(found, target)
+    discs_px, discs_px2 = compute_disc_centres(found, target)
     time_ns = "" if image.time_ns is None else image.time_ns
     for index in range(target.count):
         row, column = target.row_column(index + 1)
         yield (
             *(image.image, time_ns, index + 1, row, column),
-            *_cells(found.centres_px[index], found.covariance_px2[index]),
-            flags_text(int(found.flags[index])),
-            *_cells(discs_px[index], discs_px2[index]),
+            *_format_cells(found.centres_px[index], found.covariance_px2[index]),
+            format_flags(int(found.flags[index])),
+            *_format_cells(discs_px[index], discs_px2[index]),
         )
 
 
-def _cells(centre_px: Float, covariance_px2: Float) -> tuple[str, ...]:
+def _format_cells(centre_px: Float, covariance_px2: Float) -> tuple[str, ...]:
     """1e-6 px and 7 digits of the variances are far below the noise."""
     x, y = centre_px
     variances = (covariance_px2[0, 0], covariance_px2[0, 1], covariance_px2[1, 1])

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.markers import edge_model, newton, pixels, sandwich, sectors
-from thermostand.markers.compiled import digest, entry
-from thermostand.markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, room_for_work
+from thermostand.markers.edge_model import PARAMETERS, SIGMA, EdgeState, Float, allocate_work
+from thermostand.markers.jit import compile_entry, compute_digest
 from thermostand.markers.newton import (
     DIVERGED,
     LEAST_BAND_PX,
@@ -24,15 +24,15 @@ from thermostand.markers.newton import (
     TOO_FEW,
     Setting,
     Starts,
-    inverse,
-    mean_radius,
-    no_belief,
+    compute_inverse,
+    compute_mean_radius,
+    make_flat_prior,
     settle,
 )
 from thermostand.markers.noise import Noise
-from thermostand.markers.pixels import Picture, empty_pixels
-from thermostand.markers.sandwich import SAMPLED_MARKERS, centre_scatter, clusters_of
-from thermostand.markers.sectors import misfits
+from thermostand.markers.pixels import Picture, allocate_pixels
+from thermostand.markers.sandwich import SAMPLED_MARKERS, compute_centre_scatter, count_clusters
+from thermostand.markers.sectors import compute_misfits
 
 _SATURATED_PART = 0.1  # round number; nothing was measured
 
@@ -105,7 +105,7 @@ def fit_edges(
     )
     # A copy of `reach`: read-only memory would be another type to the compiler.
     starts = Starts(parameters, start.scale_px, np.array(reach, np.float64))
-    _fit_all(setting_of(image, start, noise, band_sigma), starts, max(1, count // sampled), found)
+    _fit_all(make_setting(image, start, noise, band_sigma), starts, max(1, count // sampled), found)
     chi, misfit, levels = found.quality.T
     return EdgeFit(
         state=EdgeState(parameters, start.scale_px),
@@ -127,26 +127,26 @@ class _Fitted(NamedTuple):
     flags: NDArray[np.uint8]
 
 
-def setting_of(image: Picture, start: EdgeState, noise: Noise, band_sigma: float) -> Setting:
+def make_setting(image: Picture, start: EdgeState, noise: Noise, band_sigma: float) -> Setting:
     """For fits from `start`."""
-    pixels = empty_pixels(_room(image, start, band_sigma))
+    pixels = allocate_pixels(_compute_capacity(image, start, band_sigma))
     variance = noise.floor_DN2, noise.slope_DN
-    return Setting(image, variance, image.full_scale_DN - 1, band_sigma, pixels, room_for_work())
+    return Setting(image, variance, image.full_scale_DN - 1, band_sigma, pixels, allocate_work())
 
 
-def _room(image: Picture, start: EdgeState, band_sigma: float) -> int:
+def _compute_capacity(image: Picture, start: EdgeState, band_sigma: float) -> int:
     """Pixels of the largest marker with its band, when it turns out half as large again and six times as blurred."""
     side = 3 * start.half_extents_px() + 12 * np.maximum(band_sigma * start.parameters[:, SIGMA, None], LEAST_BAND_PX)
     return int(min(np.nanmax(np.prod(side + 3, axis=1), initial=1), image.shape[0] * image.shape[1]))
 
 
-def _compiled_fit(sources: str) -> Callable[..., None]:
-    @entry
+def _compile_fit(sources: str) -> Callable[..., None]:
+    @compile_entry
     def fit_all(setting: Setting, starts: Starts, every: int, found: _Fitted) -> None:
         """Fit each row of the parameters in place. every: how many markers apart those are that are looked at for
         `scatter`."""
         _ = sources
-        belief, pixels, noise = no_belief(), setting.pixels, setting.noise
+        belief, pixels, noise = make_flat_prior(), setting.pixels, setting.noise
         covariance, quality, scatter, flags = found
         scatter[:] = math.nan
         for n in range(len(starts.scale)):
@@ -154,16 +154,16 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
             outcome = settle(setting, p, scale, starts.reach[n], belief)
             flags[n] = _BORDER * outcome.cut + _SATURATED * (outcome.burnt > _SATURATED_PART * outcome.seen)
             if outcome.status == SETTLED:
-                unscaled = inverse(setting.work)
+                unscaled = compute_inverse(setting.work)
                 for i in range(PARAMETERS):
                     starts.parameters[n, i] = p[i]
                     for j in range(PARAMETERS):
                         covariance[n, i, j] = unscaled[i, j] * outcome.variance
                 quality[n, 0] = math.sqrt(outcome.variance)
-                quality[n, 1], quality[n, 2] = misfits(pixels, p)
+                quality[n, 1], quality[n, 2] = compute_misfits(pixels, p)
                 if n % every == 0:
-                    clusters = clusters_of(mean_radius(p, scale))
-                    robust, independent = centre_scatter(pixels, p, scale, noise, unscaled, clusters)
+                    clusters = count_clusters(compute_mean_radius(p, scale))
+                    robust, independent = compute_centre_scatter(pixels, p, scale, noise, unscaled, clusters)
                     for axis in range(2):
                         scatter[n, 0, axis] = robust[axis]
                         scatter[n, 1, axis] = independent[axis] * outcome.variance
@@ -174,4 +174,4 @@ def _compiled_fit(sources: str) -> Callable[..., None]:
     return fit_all
 
 
-_fit_all = _compiled_fit(digest(pixels, edge_model, newton, sandwich, sectors))
+_fit_all = _compile_fit(compute_digest(pixels, edge_model, newton, sandwich, sectors))

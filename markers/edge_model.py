@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.compiled import compiled
+from thermostand.markers.jit import compile_part
 from thermostand.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, VALUE, Pixels, Single, U, V
 
 CX, CY, M11, M12, M22, SIGMA, B0, BX, BY, F0, FX, FY = range(12)
@@ -89,13 +89,13 @@ class Work(NamedTuple):
     right: Float
 
 
-def room_for_work() -> Work:
+def allocate_work() -> Work:
     """Not filled yet."""
     return Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
 
 
-@compiled
-def normal_equations(
+@compile_part
+def build_normal_equations(
     pixels: Pixels, p: Float, scale: float, noise: Variance, work: Work, is_known: bool
 ) -> tuple[float, float]:
     """Set J'WJ, unless it is known well enough from parameters near by, and J'We at the parameters `p`, write each
@@ -104,14 +104,14 @@ def normal_equations(
     work.right[:] = 0
     squares, weights = 0.0, 0.0
     for region in (GROUND, DISC):
-        more = _level_equations(pixels, region, p, scale, noise, Work(levels, work.right))
+        more = _add_level_equations(pixels, region, p, scale, noise, Work(levels, work.right))
         squares += more[0]
         weights += more[1]
     if not is_known:
         for i in range(PARAMETERS):
             for j in range(PARAMETERS):
                 normal[i, j] = levels[i, j]
-    more = _core_equations(pixels, p, scale, noise, work, is_known)
+    more = _add_core_equations(pixels, p, scale, noise, work, is_known)
     if not is_known:
         for i in range(PARAMETERS):
             for j in range(i):
@@ -119,8 +119,8 @@ def normal_equations(
     return squares + more[0], weights + more[1]
 
 
-@compiled
-def _core_equations(
+@compile_part
+def _add_core_equations(
     pixels: Pixels, p: Float, scale: float, noise: Variance, work: Work, is_known: bool
 ) -> tuple[float, float]:
     """Add the pixels near the outline to the upper half of J'WJ, unless that is known, and to J'We."""
@@ -129,7 +129,7 @@ def _core_equations(
     squares, weights = 0.0, 0.0
     for first in range(0, pixels.counts[CORE], BLOCK):
         size = load_block(block, pixels, CORE, first, p, scale)
-        more = derivatives(block, size, p, scale, noise)
+        more = compute_derivatives(block, size, p, scale, noise)
         squares += more[0]
         weights += more[1]
         _keep_residuals(block, size, pixels.table[CORE], first)
@@ -140,7 +140,7 @@ def _core_equations(
     return squares, weights
 
 
-@compiled
+@compile_part
 def load_block(block: Single, pixels: Pixels, region: int, first: int, p: Float, scale: float) -> int:
     """Copy the pixels of a region from `first` on into a block, as many as there is room for; their number."""
     table, size = pixels.table[region], min(BLOCK, pixels.counts[region] - first)
@@ -156,7 +156,7 @@ def load_block(block: Single, pixels: Pixels, region: int, first: int, p: Float,
     return size
 
 
-@compiled
+@compile_part
 def _keep_residuals(block: Single, size: int, table: Single, first: int) -> None:
     """Write what the model says about a block's pixels into the table."""
     residual, rise, at = table[RESIDUAL], table[RISE], np.uint64(first)
@@ -165,8 +165,8 @@ def _keep_residuals(block: Single, size: int, table: Single, first: int) -> None
         rise[at + k] = block[RISES * BLOCK + k]
 
 
-@compiled
-def derivatives(block: Single, size: int, p: Float, scale: float, noise: Variance) -> tuple[float, float]:
+@compile_part
+def compute_derivatives(block: Single, size: int, p: Float, scale: float, noise: Variance) -> tuple[float, float]:
     """From the first `size` pixels of `block` its weighted derivatives by the parameters and weighted residuals.
 
     Terms that vanish on the outline are left out: the fit still ends where J'We = 0, which is free of bias while the
@@ -176,7 +176,7 @@ def derivatives(block: Single, size: int, p: Float, scale: float, noise: Varianc
     m11, m12, m22, sigma = np.float32(p[M11]), np.float32(p[M12]), np.float32(p[M22]), np.float32(p[SIGMA])
     b0, bx, by = np.float32(p[B0]), np.float32(p[BX]), np.float32(p[BY])
     f0, fx, fy = np.float32(p[F0]), np.float32(p[FX]), np.float32(p[FY])
-    floor, gain, size_px = np.float32(noise[0]), np.float32(noise[1]), np.float32(scale)
+    read_variance, gain, size_px = np.float32(noise[0]), np.float32(noise[1]), np.float32(scale)
     per_sigma, sharpness = _ONE / sigma, sigma / size_px
     slope_x, slope_y = bx - fx, by - fy
     squares, weights = _ZERO, _ZERO
@@ -187,11 +187,11 @@ def derivatives(block: Single, size: int, p: Float, scale: float, noise: Varianc
         per_length = _ONE / (math.sqrt(gx * gx + gy * gy) + _TINY)
         nx, ny = gx * per_length, gy * per_length
         t = (F - _ONE) * F * per_length * size_px * per_sigma
-        step, density = normal_distribution(t)
+        step, density = evaluate_normal_distribution(t)
         disc = f0 + fx * x + fy * y
         contrast = b0 + bx * x + by * y - disc
         model = disc + contrast * step + (slope_x * nx + slope_y * ny) * density * sharpness
-        root = math.sqrt(_ONE / (floor + gain * max(model, _ZERO)))
+        root = math.sqrt(_ONE / (read_variance + gain * max(model, _ZERO)))
         residual = (block[VALUES * BLOCK + k] - model) * root
         share = block[SHARES * BLOCK + k]  # 0 or 1: its own square
         rise = contrast * density * per_sigma * root
@@ -217,8 +217,8 @@ def derivatives(block: Single, size: int, p: Float, scale: float, noise: Varianc
     return float(squares), float(weights)
 
 
-@compiled
-def normal_distribution(t: np.float32) -> tuple[np.float32, np.float32]:
+@compile_part
+def evaluate_normal_distribution(t: np.float32) -> tuple[np.float32, np.float32]:
     """The normal distribution function and its density, by Taylor's series from the nearest node; error below 2e-7."""
     t = min(max(t, -_TABLE_END), _TABLE_END)
     cell = np.uint32(np.int32((t + _TABLE_END) * _CELLS_PER + _HALF))
@@ -231,7 +231,7 @@ def normal_distribution(t: np.float32) -> tuple[np.float32, np.float32]:
     )
 
 
-@compiled
+@compile_part
 def _add_products(rows: Single, i: int, j: int, size: int, normal: Float) -> None:
     """Add the products of rows i..i+2 with rows j..j+2: nine sums at a time stay in registers."""
     a0 = a1 = a2 = b0 = b1 = b2 = c0 = c1 = c2 = _ZERO
@@ -245,7 +245,7 @@ def _add_products(rows: Single, i: int, j: int, size: int, normal: Float) -> Non
             normal[i + row, j + column] += sums[column]
 
 
-@compiled
+@compile_part
 def _add_right(rows: Single, i: int, size: int, right: Float) -> None:
     """Add the products of rows i..i+2 with the residuals."""
     sa = sb = sc = _ZERO
@@ -257,8 +257,8 @@ def _add_right(rows: Single, i: int, size: int, right: Float) -> None:
     right[i + 2] += sc
 
 
-@compiled
-def _level_equations(
+@compile_part
+def _add_level_equations(
     pixels: Pixels, region: int, p: Float, scale: float, noise: Variance, work: Work
 ) -> tuple[float, float]:
     """Add the pixels of a region that sees only the plane of its level."""
@@ -266,13 +266,13 @@ def _level_equations(
     first = B0 if region == GROUND else F0
     u, v, value, share, residual = table[U], table[V], table[VALUE], table[SHARE], table[RESIDUAL]
     cx, cy = np.float32(p[CX] - pixels.origin[0]), np.float32(p[CY] - pixels.origin[1])
-    per_scale, floor, gain = np.float32(1 / scale), np.float32(noise[0]), np.float32(noise[1])
+    per_scale, read_variance, gain = np.float32(1 / scale), np.float32(noise[0]), np.float32(noise[1])
     level, slope_x, slope_y = np.float32(p[first]), np.float32(p[first + 1]), np.float32(p[first + 2])
     n = sx = sy = sxx = sxy = syy = e = ex = ey = squares = weights = _ZERO
     for k in range(np.uint64(pixels.counts[region])):
         x, y = (u[k] - cx) * per_scale, (v[k] - cy) * per_scale
         model = level + slope_x * x + slope_y * y
-        weight = _ONE / (floor + gain * max(model, _ZERO))
+        weight = _ONE / (read_variance + gain * max(model, _ZERO))
         difference = value[k] - model
         residual[k] = difference * math.sqrt(weight)
         weight *= share[k]

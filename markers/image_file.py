@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import PIL.Image
 
-from thermostand.foundation.image_limit import size_fault
-from thermostand.markers.detection import DetectionError, Image, grey_image
+from thermostand.foundation.image_limit import describe_size_fault
+from thermostand.markers.detection import DetectionError, Image, convert_to_grey
 
 _ORIENTATION, _UPRIGHT = 0x0112, 1
 """EXIF tag (CIPA DC-008, table 4) and its value for pixels that are stored as they are to be shown."""
@@ -34,7 +34,7 @@ def read_image(path: Path | str) -> Image:
         data = Path(path).read_bytes()
     except OSError as error:
         raise DetectionError(f"{path}: cannot be read ({error.strerror})") from error
-    fault = _fault(data)
+    fault = _find_fault(data)
     if fault:
         raise DetectionError(f"{path}: {fault}")
     try:
@@ -44,12 +44,12 @@ def read_image(path: Path | str) -> Image:
     if image is None:
         raise DetectionError(f"{path}: not an image, or damaged")
     try:
-        return grey_image(image)  # pyright: ignore[reportArgumentType] - checked there
+        return convert_to_grey(image)  # pyright: ignore[reportArgumentType] - checked there
     except ValueError as error:
         raise DetectionError(f"{path}: {error}") from error
 
 
-def _turned(orientation: int) -> str:
+def _describe_orientation(orientation: int) -> str:
     """What an EXIF orientation says against reading the pixels as they are stored, "" when it is upright or unknown."""
     if orientation <= _UPRIGHT or orientation > max(_TURNS):
         return ""
@@ -59,15 +59,15 @@ def _turned(orientation: int) -> str:
     )
 
 
-def _fault(data: bytes) -> str:
+def _find_fault(data: bytes) -> str:
     """What its header says against reading it, "" when nothing."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of what is below our limit
             with PIL.Image.open(io.BytesIO(data)) as image:  # which decodes nothing yet
-                if fault := size_fault(*image.size):
+                if fault := describe_size_fault(*image.size):
                     return f"{fault} (--max-megapixels)"
-                return _turned(int(image.getexif().get(_ORIENTATION, _UPRIGHT)))
+                return _describe_orientation(int(image.getexif().get(_ORIENTATION, _UPRIGHT)))
     except PIL.Image.DecompressionBombError:
         return "claims far more pixels than any camera has"
     except _NO_IMAGE:

@@ -27,7 +27,7 @@ Index = NDArray[np.intp]
 Cell = tuple[int, int]
 
 
-def largest_lattice(points: Float, count: int) -> dict[Cell, int]:
+def grow_largest_lattice(points: Float, count: int) -> dict[Cell, int]:
     """Cell -> candidate of the largest lattice; seeds nearest to the middle first, until one holds `count`."""
     best: dict[Cell, int] = {}
     tried: set[int] = set()
@@ -49,7 +49,7 @@ def largest_lattice(points: Float, count: int) -> dict[Cell, int]:
 
 def _grow(points: Float, near: Index, seed: int) -> dict[Cell, int]:
     """The lattice around a seed, empty when the seed has no two neighbours to begin with."""
-    base = _lattice_vectors(points, near[seed])
+    base = _find_lattice_vectors(points, near[seed])
     cells: dict[Cell, int] = {(0, 0): seed}
     if base is None:
         return {}
@@ -61,8 +61,8 @@ def _grow(points: Float, near: Index, seed: int) -> dict[Cell, int]:
             beyond = (cell[0] + direction[0], cell[1] + direction[1])
             if beyond in cells:
                 continue
-            step = _predicted_step(cell, direction, base, cells, points)
-            found = _nearest(points, near[cells[cell]], points[cells[cell]] + step)
+            step = _predict_step(cell, direction, base, cells, points)
+            found = _find_nearest(points, near[cells[cell]], points[cells[cell]] + step)
             if found in used or math.dist(points[found], points[cells[cell]] + step) > _STEP_TOLERANCE * math.hypot(
                 *step
             ):
@@ -73,23 +73,23 @@ def _grow(points: Float, near: Index, seed: int) -> dict[Cell, int]:
     return cells
 
 
-def _nearest(points: Float, among: Index, place: Float) -> int:
+def _find_nearest(points: Float, among: Index, place: Float) -> int:
     offset = points[among] - place
     return int(among[np.argmin(np.einsum("ij,ij->i", offset, offset))])
 
 
-def _lattice_vectors(points: Float, near: Index) -> tuple[Float, Float] | None:
+def _find_lattice_vectors(points: Float, near: Index) -> tuple[Float, Float] | None:
     """To the nearest neighbour, and to the nearest of the next 8 that is well off that line; near[0] is the seed."""
     offset = points[near[1:10]] - points[near[0]]
     first = offset[0]
     for other in offset[1:]:
         # At least 37 degrees off the first: from rendered poses up to 45 degrees of tilt.
-        if abs(_cross(first, other)) > 0.6 * np.hypot(*first) * np.hypot(*other):
+        if abs(_compute_cross_product(first, other)) > 0.6 * np.hypot(*first) * np.hypot(*other):
             return first, other
     return None
 
 
-def _predicted_step(
+def _predict_step(
     cell: Cell,
     direction: Cell,
     base: tuple[Float, Float],
@@ -112,5 +112,5 @@ def _predicted_step(
     return base[0] * di + base[1] * dj
 
 
-def _cross(a: Float, b: Float) -> float:
+def _compute_cross_product(a: Float, b: Float) -> float:
     return float(a[0] * b[1] - a[1] * b[0])

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermostand.markers.compiled import compiled
 from thermostand.markers.edge_model import (
     B0,
     BX,
@@ -25,10 +24,11 @@ from thermostand.markers.edge_model import (
     Float,
     Variance,
     Work,
-    normal_equations,
+    build_normal_equations,
 )
+from thermostand.markers.jit import compile_part
 from thermostand.markers.pixels import SHARE, VALUE, Gathered, Limits, Picture, Pixels, U, V, gather
-from thermostand.markers.sectors import SECTORS, Bools, all_kept, number_of, set_aside
+from thermostand.markers.sectors import SECTORS, Bools, count_kept, make_all_kept, mask_sectors
 
 # With a blur of 0.5 px the narrow band would be 2.25 px wide, and the levels of ground and disc hang on few pixels.
 LEAST_BAND_PX = 3.5
@@ -96,7 +96,7 @@ class Starts(NamedTuple):
     reach: Float
 
 
-class Belief(NamedTuple):
+class Prior(NamedTuple):
     """What is known before looking: sectors `kept` (36,), the others are not looked at; m11, m12, m22 and sigma (4,),
     with weights (4,), 1 / variance, 0 where nothing is known."""
 
@@ -105,34 +105,34 @@ class Belief(NamedTuple):
     weight: Float
 
 
-@compiled
-def no_belief() -> Belief:
+@compile_part
+def make_flat_prior() -> Prior:
     """All sectors count, and any shape is as likely as any other."""
-    return Belief(all_kept(), np.zeros(4), np.zeros(4))
+    return Prior(make_all_kept(), np.zeros(4), np.zeros(4))
 
 
-@compiled
-def settle(setting: Setting, p: Float, scale: float, reach: Float, belief: Belief) -> Outcome:
+@compile_part
+def settle(setting: Setting, p: Float, scale: float, reach: Float, belief: Prior) -> Outcome:
     """Fit `p` (12,) to the image in place. The pixels are gathered again when the outline has left them or turned out
     more blurred than it was thought to be, which also makes the result independent of the start. reach (2,): from where
     to where its pixels may lie, in radii."""
     start, gathered_at = p.copy(), p.copy()
     pixels, work, noise, band_sigma = setting.pixels, setting.work, setting.noise, setting.band_sigma
     far = math.isnan(p[B0])
-    gathered = look(setting, p, scale, band(p, scale, reach, far, band_sigma), belief)
+    gathered = gather_band(setting, p, scale, compute_limits(p, scale, reach, far, band_sigma), belief)
     gatherings, variance, is_near = 1, math.nan, False
     if far:
         set_start_levels(pixels, p, scale)
-    fixed = mean_radius(p, scale) < _SLOPES_FROM_PX
+    fixed = compute_mean_radius(p, scale) < _SLOPES_FROM_PX
     for _ in range(_STEPS):
-        variance, step = next_step(setting, p, scale, belief, fixed, is_near)
+        variance, step = compute_next_step(setting, p, scale, belief, fixed, is_near)
         if math.isnan(variance):
             return Outcome(TOO_FEW, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         for i in range(PARAMETERS):
             p[i] += step[i]
-        if not possible(p, noise) or strayed(start, p, scale, 1.5):
+        if not is_possible(p, noise) or has_strayed(start, p, scale, 1.5):
             return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
-        length, gained = math.hypot(step[CX], step[CY]), gain(work, step)
+        length, gained = math.hypot(step[CX], step[CY]), compute_gain(work, step)
         far = length > _FAR_PX
         is_last = is_short(length, gained / variance, is_near)
         # The last step takes J'WJ from the one before, scaled by the blurs' ratio; without the scaling centres are off
@@ -140,8 +140,8 @@ def settle(setting: Setting, p: Float, scale: float, reach: Float, belief: Belie
         is_near = not is_near and length < _NEAR_PX and gained < _NEAR_GAIN * variance
         if is_near:
             sharpen(work, (p[SIGMA] - step[SIGMA]) / p[SIGMA])
-        if gatherings < _GATHERINGS and moved_off(gathered_at, p, scale, band_sigma):
-            gathered = look(setting, p, scale, band(p, scale, reach, far, band_sigma), belief)
+        if gatherings < _GATHERINGS and has_moved_off(gathered_at, p, scale, band_sigma):
+            gathered = gather_band(setting, p, scale, compute_limits(p, scale, reach, far, band_sigma), belief)
             gathered_at = p.copy()
             gatherings += 1
             is_near = False
@@ -149,28 +149,28 @@ def settle(setting: Setting, p: Float, scale: float, reach: Float, belief: Belie
                 return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
         elif is_last:
             break
-    if strayed(start, p, scale, 1.0):
+    if has_strayed(start, p, scale, 1.0):
         return Outcome(DIVERGED, math.nan, gathered.seen, gathered.burnt, gathered.cut)
     return Outcome(SETTLED, variance, gathered.seen, gathered.burnt, gathered.cut)
 
 
-@compiled
-def next_step(
-    setting: Setting, p: Float, scale: float, belief: Belief, fixed: bool, is_near: bool
+@compile_part
+def compute_next_step(
+    setting: Setting, p: Float, scale: float, belief: Prior, fixed: bool, is_near: bool
 ) -> tuple[float, Float]:
     """The variance of a pixel about the model, NaN when there are too few for it, and the step (12,) from `p`. fixed:
     the levels have no slopes. is_near: J'WJ is that of the step before."""
     free, work = PARAMETERS - 4 * fixed, setting.work
-    squares, weights = normal_equations(setting.pixels, p, scale, setting.noise, work, is_near)
+    squares, weights = build_normal_equations(setting.pixels, p, scale, setting.noise, work, is_near)
     if weights < _PIXELS_PER_PARAMETER * free:
         return math.nan, p
-    add_belief(work, p, belief, is_near)
+    add_prior(work, p, belief, is_near)
     if fixed:
         hold_slopes(work)
-    return squares / (weights - free), limited(newton_step(work), p, scale)
+    return squares / (weights - free), limit_step(solve_newton_step(work), p, scale)
 
 
-@compiled
+@compile_part
 def is_short(length_px: float, gain: float, is_near: bool) -> bool:
     """Whether a step is the last one. gain: in variances of a pixel, less than one's share once all twelve parameters
     have settled."""
@@ -179,17 +179,17 @@ def is_short(length_px: float, gain: float, is_near: bool) -> bool:
     return length_px < _CONVERGED_PX and gain < 1
 
 
-@compiled
-def look(setting: Setting, p: Float, scale: float, limits: Limits, belief: Belief) -> Gathered:
+@compile_part
+def gather_band(setting: Setting, p: Float, scale: float, limits: Limits, belief: Prior) -> Gathered:
     """Gather the pixels round the outline of `p`, without those of sectors that are not kept."""
     gathered = gather(setting.image, p[:SIGMA], scale, limits, setting.ceiling, setting.pixels)
-    if number_of(belief.kept) < SECTORS:
-        set_aside(setting.pixels, p, belief.kept)
+    if count_kept(belief.kept) < SECTORS:
+        mask_sectors(setting.pixels, p, belief.kept)
     return gathered
 
 
-@compiled
-def add_belief(work: Work, p: Float, belief: Belief, is_in_normal: bool) -> None:
+@compile_part
+def add_prior(work: Work, p: Float, belief: Prior, is_in_normal: bool) -> None:
     """Pull the shape and the blur to what they are believed to be."""
     for i in range(4):
         if not is_in_normal:
@@ -197,30 +197,30 @@ def add_belief(work: Work, p: Float, belief: Belief, is_in_normal: bool) -> None
         work.right[M11 + i] += belief.weight[i] * (belief.mean[i] - p[M11 + i])
 
 
-@compiled
-def band(p: Float, scale: float, reach: Float, far: bool, band_sigma: float) -> Limits:
+@compile_part
+def compute_limits(p: Float, scale: float, reach: Float, far: bool, band_sigma: float) -> Limits:
     """The limits of the pixels that are looked at, in F, along the shorter axis; the longer one has more. far: the
     outline is not known well enough to say what is far from it, so that all belong to the core."""
-    least = mean_radius(p, scale) ** 2 / long_axis(p, scale)
+    least = compute_mean_radius(p, scale) ** 2 / compute_long_axis(p, scale)
     width = max(band_sigma * p[SIGMA], LEAST_BAND_PX) / least
     core = width if far else min(CORE_SIGMA * p[SIGMA] / least, width)
     return Limits(max(1 - width, reach[0]), max(1 - core, reach[0]), 1 + core, min(1 + width, reach[1]))
 
 
-@compiled
-def mean_radius(p: Float, scale: float) -> float:
+@compile_part
+def compute_mean_radius(p: Float, scale: float) -> float:
     """Geometric mean of the semi-axes, px."""
     return scale / (p[M11] * p[M22] - p[M12] * p[M12]) ** 0.25
 
 
-@compiled
-def long_axis(p: Float, scale: float) -> float:
+@compile_part
+def compute_long_axis(p: Float, scale: float) -> float:
     """The longer semi-axis, px."""
     half = 0.5 * (p[M11] + p[M22])
     return scale / math.sqrt(half - math.sqrt(max(half * half - p[M11] * p[M22] + p[M12] * p[M12], 0.0)))
 
 
-@compiled
+@compile_part
 def set_start_levels(pixels: Pixels, p: Float, scale: float) -> None:
     """Set the levels to the means on either side of the outline."""
     sums, counts = np.zeros(2), np.zeros(2)
@@ -237,7 +237,7 @@ def set_start_levels(pixels: Pixels, p: Float, scale: float) -> None:
     p[F0], p[B0] = sums[0] / counts[0], sums[1] / counts[1]
 
 
-@compiled
+@compile_part
 def sharpen(work: Work, ratio: float) -> None:
     """Make J'WJ that of a blur so many times smaller: what is known of the outline goes with the edge's steepness."""
     for i in range(SIGMA + 1):
@@ -245,7 +245,7 @@ def sharpen(work: Work, ratio: float) -> None:
             work.normal[i, j] *= ratio
 
 
-@compiled
+@compile_part
 def hold_slopes(work: Work) -> None:
     """Make the slopes of the levels stay as they are."""
     for i in (BX, BY, FX, FY):
@@ -254,8 +254,8 @@ def hold_slopes(work: Work) -> None:
         work.right[i] = 0
 
 
-@compiled
-def newton_step(work: Work) -> Float:
+@compile_part
+def solve_newton_step(work: Work) -> Float:
     """The step that solves J'WJ step = J'We, by the Cholesky decomposition of the matrix with a unit diagonal."""
     factor, size = _cholesky(work.normal)
     step = work.right.copy()
@@ -263,8 +263,8 @@ def newton_step(work: Work) -> Float:
     return step
 
 
-@compiled
-def gain(work: Work, step: Float) -> float:
+@compile_part
+def compute_gain(work: Work, step: Float) -> float:
     """What a step takes from the sum of squared residuals."""
     total = 0.0
     for i in range(PARAMETERS):
@@ -272,8 +272,8 @@ def gain(work: Work, step: Float) -> float:
     return total
 
 
-@compiled
-def inverse(work: Work) -> Float:
+@compile_part
+def compute_inverse(work: Work) -> Float:
     """The inverse of J'WJ (12, 12)."""
     factor, size = _cholesky(work.normal)
     columns = np.zeros((PARAMETERS, PARAMETERS))
@@ -283,7 +283,7 @@ def inverse(work: Work) -> Float:
     return columns
 
 
-@compiled
+@compile_part
 def _cholesky(normal: Float) -> tuple[Float, Float]:
     """Lower factor of `normal` divided by `size` on both sides, and that size, the root of the diagonal. 1e-9 on the
     diagonal keeps parameters that nothing is known about where they are."""
@@ -299,7 +299,7 @@ def _cholesky(normal: Float) -> tuple[Float, Float]:
     return factor, size
 
 
-@compiled
+@compile_part
 def _solve(factor: Float, size: Float, right: Float) -> None:
     """Replace `right` by the solution of the equations whose factor and size are given."""
     for i in range(PARAMETERS):
@@ -315,8 +315,8 @@ def _solve(factor: Float, size: Float, right: Float) -> None:
         right[i] /= size[i]
 
 
-@compiled
-def limited(step: Float, p: Float, scale: float) -> Float:
+@compile_part
+def limit_step(step: Float, p: Float, scale: float) -> Float:
     """The step, shortened where it would throw the centre or the outline too far, or the blur."""
     far = math.hypot(step[CX], step[CY]) / min(_GREATEST_STEP_PX, 0.5 * scale)
     bend = max(abs(step[M11]), abs(step[M12]), abs(step[M22]))
@@ -328,8 +328,8 @@ def limited(step: Float, p: Float, scale: float) -> Float:
     return step
 
 
-@compiled
-def possible(p: Float, noise: Variance) -> bool:
+@compile_part
+def is_possible(p: Float, noise: Variance) -> bool:
     """Whether the parameters are those of an ellipse with an edge that stands out of the noise."""
     edge = abs(p[B0] - p[F0]) > _LEAST_CONTRAST_SIGMA * math.sqrt(noise[0] + noise[1] * max(p[B0], 0.0))
     ellipse = p[M11] > 0 and p[M11] * p[M22] > p[M12] * p[M12]
@@ -339,27 +339,27 @@ def possible(p: Float, noise: Variance) -> bool:
     return finite and ellipse and edge and p[SIGMA] >= _LEAST_SIGMA_PX
 
 
-@compiled
-def strayed(start: Float, p: Float, scale: float, radii: float) -> bool:
+@compile_part
+def has_strayed(start: Float, p: Float, scale: float, radii: float) -> bool:
     """Whether it is more than some radii from where it began, or more than twice or less than half the size."""
-    before, after = half_extents(start, scale), half_extents(p, scale)
+    before, after = compute_half_extents(start, scale), compute_half_extents(p, scale)
     ratio_x, ratio_y = after[0] / before[0], after[1] / before[1]
-    moved = math.hypot(p[CX] - start[CX], p[CY] - start[CY]) > radii * mean_radius(start, scale)
+    moved = math.hypot(p[CX] - start[CX], p[CY] - start[CY]) > radii * compute_mean_radius(start, scale)
     return moved or max(ratio_x, ratio_y) > 2 or min(ratio_x, ratio_y) < 0.5
 
 
-@compiled
-def moved_off(gathered_at: Float, p: Float, scale: float, band_sigma: float) -> bool:
+@compile_part
+def has_moved_off(gathered_at: Float, p: Float, scale: float, band_sigma: float) -> bool:
     """Whether the pixels gathered for one outline are not the right ones for another."""
-    before, after = half_extents(gathered_at, scale), half_extents(p, scale)
+    before, after = compute_half_extents(gathered_at, scale), compute_half_extents(p, scale)
     moved = math.hypot(p[CX] - gathered_at[CX], p[CY] - gathered_at[CY])
     grown = max(abs(after[0] - before[0]), abs(after[1] - before[1]))
     widths = max(band_sigma * gathered_at[SIGMA], LEAST_BAND_PX), max(band_sigma * p[SIGMA], LEAST_BAND_PX)
     return abs(widths[1] - widths[0]) > _BAND_TOLERANCE * widths[0] or moved + grown > _MOVE_TOLERANCE_SIGMA * p[SIGMA]
 
 
-@compiled
-def half_extents(p: Float, scale: float) -> tuple[float, float]:
+@compile_part
+def compute_half_extents(p: Float, scale: float) -> tuple[float, float]:
     """Half width and half height of the ellipse's bounding box, px."""
     determinant = p[M11] * p[M22] - p[M12] * p[M12]
     return scale * math.sqrt(p[M22] / determinant), scale * math.sqrt(p[M11] / determinant)

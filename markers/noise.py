@@ -48,7 +48,7 @@ class Noise:
         return self.floor_DN2 + self.slope_DN * np.maximum(signal_DN, 0)
 
 
-def full_scale_DN(image: Image) -> int:
+def find_full_scale_DN(image: Image) -> int:
     """Largest value a pixel can have, found from the picture, as files and frames do not carry the pixel format.
 
     255 of 8 bits. Of 16: 2^k - 1 for the smallest k of `_DEPTHS_bit` that holds the brightest pixel, as cameras fill
@@ -74,20 +74,22 @@ def estimate_noise(images: Sequence[Image], windows: NDArray[np.int32] | None = 
     too few such pixels.
     """
     pairs = [
-        _pair(one, two, windows) for one, two in pairwise(images) if (one.shape, one.dtype) == (two.shape, two.dtype)
+        _pair_samples(one, two, windows)
+        for one, two in pairwise(images)
+        if (one.shape, one.dtype) == (two.shape, two.dtype)
     ]
     if not pairs:
         return None
     signal, noise = (np.concatenate(values) for values in zip(*pairs, strict=True))
     if len(signal) < _LEAST_PIXELS:
         return None
-    bins = np.array_split(_order(signal), _BINS)
+    bins = np.array_split(_sort_indices(signal), _BINS)
     means = np.array([signal[part].astype(np.float64).mean() for part in bins])
-    variances = np.maximum([_clipped_variance(noise[part].astype(np.float64)) for part in bins], _ROUNDING_DN2)
-    return _line(means, variances)
+    variances = np.maximum([_compute_clipped_variance(noise[part].astype(np.float64)) for part in bins], _ROUNDING_DN2)
+    return _fit_line(means, variances)
 
 
-def _order(signal: Float32) -> NDArray[np.int64]:
+def _sort_indices(signal: Float32) -> NDArray[np.int64]:
     """np.argsort(signal, kind="stable"). The means of 8-bit pixels have few values, whose numbers NumPy sorts by their
     digits: a third of the time for millions of them."""
     numbers = np.rint(signal * _MEANS_PER_DN)
@@ -100,13 +102,13 @@ def _order(signal: Float32) -> NDArray[np.int64]:
     return np.argsort(signal, kind="stable")
 
 
-def _pair(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Float32, Float32]:
+def _pair_samples(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Float32, Float32]:
     """Signal, and a sample of the noise of one pixel, for pairs of neighbours on even ground."""
     mean = cv2.blur(cv2.addWeighted(one, 0.5, two, 0.5, 0, dtype=cv2.CV_32F), (_MEAN_px, _MEAN_px))
     box = np.ones((_EDGE_px, _EDGE_px), np.uint8)
     change = cv2.dilate(mean, box) - cv2.erode(mean, box)
     flat = change < _FLAT_PART * float(mean.max() - mean.min()) + _FLAT_SIGMA * float(np.sqrt(np.median(mean) + 1))
-    flat &= np.maximum(one, two) < full_scale_DN(one) - 1
+    flat &= np.maximum(one, two) < find_full_scale_DN(one) - 1
     if windows is not None:
         inside = np.zeros(one.shape, bool)
         for x, y, width, height in windows:
@@ -122,22 +124,22 @@ def _pair(one: Image, two: Image, windows: NDArray[np.int32] | None) -> tuple[Fl
     )
 
 
-def _clipped_variance(values: Float) -> float:
+def _compute_clipped_variance(values: Float) -> float:
     """Variance without what is beyond five standard deviations: a hot pixel, a moving speck of dust."""
     for _ in range(2):
         values = values[np.abs(values) <= 5 * values.std() + _TINY_DN]
     return float(np.mean(values**2))
 
 
-def _line(means: Float, variances: Float) -> Noise:
+def _fit_line(means: Float, variances: Float) -> Noise:
     """The straight line through the variances, each as uncertain as it is large; neither part is below what it can
     be."""
     weight = 1 / variances
     design = np.stack([np.ones_like(means), means], axis=1) * weight[:, None]
-    floor, slope = np.linalg.lstsq(design, variances * weight, rcond=None)[0]
+    read_variance, slope = np.linalg.lstsq(design, variances * weight, rcond=None)[0]
     if slope < 0:
         return Noise(float(np.mean(variances)), 0.0)
-    if floor < _ROUNDING_DN2:
+    if read_variance < _ROUNDING_DN2:
         through = np.sum((variances - _ROUNDING_DN2) * means * weight**2) / max(np.sum((means * weight) ** 2), _TINY_DN)
         return Noise(_ROUNDING_DN2, max(float(through), 0.0))
-    return Noise(float(floor), float(slope))
+    return Noise(float(read_variance), float(slope))

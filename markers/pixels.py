@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.compiled import compiled
-from thermostand.markers.noise import Image, full_scale_DN
+from thermostand.markers.jit import compile_part
+from thermostand.markers.noise import Image, find_full_scale_DN
 
 Float = NDArray[np.float64]
 Columns = NDArray[np.int64]
@@ -97,7 +97,7 @@ class Picture(NamedTuple):
         return pixels[row * width + column].astype(np.int64)
 
 
-def picture_of(image: Image, rows: Mask | None = None) -> Picture:
+def make_picture(image: Image, rows: Mask | None = None) -> Picture:
     """The image for `gather`: one type for the compiler, whatever the image's depth and whether or not the caller may
     write it. A copy only of an image that is not contiguous, or of a machine whose high bytes come first. rows:
     (height,), those of the image that are there, which must be of 8 bit then: other depths are seen by all pixels."""
@@ -105,15 +105,15 @@ def picture_of(image: Image, rows: Mask | None = None) -> Picture:
     view = low_first.view(np.uint8).reshape(*image.shape, image.itemsize)
     view.flags.writeable = False
     is_there = np.ones(len(image), np.bool_) if rows is None else rows
-    return Picture(view, full_scale_DN(image), is_there, np.zeros(1, np.bool_))
+    return Picture(view, find_full_scale_DN(image), is_there, np.zeros(1, np.bool_))
 
 
-def empty_pixels(capacity: int) -> Pixels:
+def allocate_pixels(capacity: int) -> Pixels:
     """Room for `capacity` pixels in each region."""
     return Pixels(np.empty((3, _ROWS, capacity + _AT_ONCE), np.float32), np.zeros(3, np.int64), np.zeros(2, np.int64))
 
 
-@compiled
+@compile_part
 def gather(image: Picture, ellipse: Float, scale: float, limits: Limits, ceiling: int, pixels: Pixels) -> Gathered:
     """Fill `pixels` from the image, row by row, with those whose F lies in `limits`; `ellipse` (5,) is cx, cy, m11,
     m12, m22.
@@ -154,24 +154,24 @@ def gather(image: Picture, ellipse: Float, scale: float, limits: Limits, ceiling
     for region in range(3):
         burnt += _share_all(pixels.table[region], int(count[region]), np.float32(ceiling))
     if burnt > 0:
-        _set_burnt_aside(pixels, centre, shape, scale, ceiling)
+        _mask_saturated(pixels, centre, shape, scale, ceiling)
     return Gathered(seen, burnt, cut)
 
 
-@compiled
+@compile_part
 def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, limits: Limits) -> None:
     """Where the parts of a row at height y begin, and the last one ends: into the ellipses, one inside the other, and
     out of them again. A part is empty where the row misses its ellipse."""
     begin, end = -(1 << 40), 1 << 40
     for i, F in enumerate((limits.ground, limits.core_out, limits.core_in, limits.disc)):
-        first, last = _columns(cx, shape, scale, y, F)
+        first, last = _find_columns(cx, shape, scale, y, F)
         if first > last:
             first, last = end, end
         begin, end = min(max(first, begin), end), max(min(last + 1, end), begin)
         ends[i], ends[len(_PARTS) - i] = begin, end
 
 
-@compiled
+@compile_part
 def _copy_run(flat: Bytes, run: Run, table: Single, slot: int, room: int) -> None:
     """Write the pixels of a run of the image's bytes into the table from `slot` on, and up to 7 more behind them.
 
@@ -195,7 +195,7 @@ def _copy_run(flat: Bytes, run: Run, table: Single, slot: int, room: int) -> Non
             table[values + k] = np.float32(low | high << np.int32(8))
 
 
-@compiled
+@compile_part
 def _share_all(table: Single, count: int, ceiling: np.float32) -> int:
     """Give all pixels of a region the share 1; how many of them are saturated."""
     burnt = 0
@@ -205,8 +205,8 @@ def _share_all(table: Single, count: int, ceiling: np.float32) -> int:
     return burnt
 
 
-@compiled
-def _columns(cx: float, shape: Float, scale: float, y: float, F: float) -> tuple[int, int]:
+@compile_part
+def _find_columns(cx: float, shape: Float, scale: float, y: float, F: float) -> tuple[int, int]:
     """First and last column of the ellipse F at height y; none, from far right to far left, above and below it."""
     root = (shape[1] * y) ** 2 - shape[0] * (shape[2] * y * y - F * F)
     if root <= 0 or F <= 0:
@@ -216,8 +216,8 @@ def _columns(cx: float, shape: Float, scale: float, y: float, F: float) -> tuple
     return math.ceil(cx + scale * left), math.floor(cx + scale * right)
 
 
-@compiled
-def _set_burnt_aside(pixels: Pixels, centre: Float, shape: Float, scale: float, ceiling: int) -> None:
+@compile_part
+def _mask_saturated(pixels: Pixels, centre: Float, shape: Float, scale: float, ceiling: int) -> None:
     """Give saturated pixels the share 0, but for those on a side of the outline a quarter of which is saturated."""
     burnt, side = np.zeros(2, np.int64), np.zeros(2, np.int64)
     cx, cy = centre[0] - pixels.origin[0], centre[1] - pixels.origin[1]

@@ -15,13 +15,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermostand.markers import edge_model, newton, pixels, sectors
-from thermostand.markers.compiled import compiled, digest, entry
-from thermostand.markers.edge_fit import setting_of
-from thermostand.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, normal_equations
-from thermostand.markers.newton import SETTLED, Belief, Setting, Starts, band, inverse, look, settle
+from thermostand.markers.edge_fit import make_setting
+from thermostand.markers.edge_model import M11, PARAMETERS, SIGMA, EdgeState, Float, build_normal_equations
+from thermostand.markers.jit import compile_entry, compile_part, compute_digest
+from thermostand.markers.newton import (
+    SETTLED,
+    Prior,
+    Setting,
+    Starts,
+    compute_inverse,
+    compute_limits,
+    gather_band,
+    settle,
+)
 from thermostand.markers.noise import Noise
 from thermostand.markers.pixels import Picture
-from thermostand.markers.sectors import SECTORS, Bools, all_kept, number_of, sector_misfits
+from thermostand.markers.sectors import SECTORS, Bools, compute_sector_misfits, count_kept, make_all_kept
 
 _LEAST_SECTORS = 13
 """35 %: with fewer the centre hangs on the shape that the other markers have."""
@@ -54,22 +63,22 @@ def refit_edges(
     covariance, chi = np.empty((count, 2, 2)), np.empty(count)
     # A copy of `reach`: read-only memory would be another type to the compiler.
     starts = Starts(parameters, start.scale_px, np.array(reach, np.float64))
-    setting = setting_of(image, start, noise, band_sigma)
+    setting = make_setting(image, start, noise, band_sigma)
     _refit_all(setting, starts, 1 / spread**2, _GREATEST_MISFIT * max(patience, 1.0), covariance, chi)
     return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
 
 
-@compiled
+@compile_part
 def drop_strangers(kept: Bools, misfits: Float, greatest: float) -> None:
     """Drop what stands out before anything is fitted: a sheet over a third of the disc tilts both planes so much that
     good sectors look as bad as covered ones. Levels that the other markers get wrong are wrong everywhere."""
-    limit = max(greatest, _STRANGE * _median(misfits))
+    limit = max(greatest, _STRANGE * _compute_median(misfits))
     for place in range(SECTORS):
         kept[place] = kept[place] and misfits[place] <= limit
 
 
-@compiled
-def _median(values: Float) -> float:
+@compile_part
+def _compute_median(values: Float) -> float:
     """Of an even number of values."""
     ordered = values.copy()
     for i in range(1, len(ordered)):
@@ -80,7 +89,7 @@ def _median(values: Float) -> float:
     return 0.5 * (ordered[middle - 1] + ordered[middle])
 
 
-@compiled
+@compile_part
 def drop_worst(kept: Bools, misfits: Float, greatest: float) -> bool:
     """Whether there were sectors to drop: the worst one above `greatest`, and those nearly as bad."""
     worst = 0.0
@@ -95,7 +104,7 @@ def drop_worst(kept: Bools, misfits: Float, greatest: float) -> bool:
     return True
 
 
-@compiled
+@compile_part
 def drop_neighbours(kept: Bools) -> None:
     """Drop the sectors beside dropped ones: glare has no edge, and what is left of it looks like a slope."""
     before = kept.copy()
@@ -103,8 +112,8 @@ def drop_neighbours(kept: Bools) -> None:
         kept[place] = before[place - 1] and before[place] and before[(place + 1) % SECTORS]
 
 
-def _compiled_refit(sources: str) -> Callable[..., None]:
-    @entry
+def _compile_refit(sources: str) -> Callable[..., None]:
+    @compile_entry
     def refit_all(
         setting: Setting, starts: Starts, weight: Float, greatest: float, covariance: Float, chi: Float
     ) -> None:
@@ -115,25 +124,25 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
         for n in range(len(starts.scale)):
             p, scale, reach = starts.parameters[n].copy(), starts.scale[n], starts.reach[n]
             covariance[n], chi[n] = math.nan, math.nan
-            belief = Belief(all_kept(), p[M11 : SIGMA + 1].copy(), weight[n])
-            look(setting, p, scale, band(p, scale, reach, False, setting.band_sigma), belief)
-            normal_equations(pixels, p, scale, setting.noise, work, False)
-            drop_strangers(belief.kept, sector_misfits(pixels, p), greatest)
+            belief = Prior(make_all_kept(), p[M11 : SIGMA + 1].copy(), weight[n])
+            gather_band(setting, p, scale, compute_limits(p, scale, reach, False, setting.band_sigma), belief)
+            build_normal_equations(pixels, p, scale, setting.noise, work, False)
+            drop_strangers(belief.kept, compute_sector_misfits(pixels, p), greatest)
             searching = True
-            while searching and number_of(belief.kept) >= _LEAST_SECTORS:
+            while searching and count_kept(belief.kept) >= _LEAST_SECTORS:
                 outcome = settle(setting, p, scale, reach, belief)
                 if outcome.status != SETTLED:
                     break
-                searching = drop_worst(belief.kept, sector_misfits(pixels, p), greatest)
+                searching = drop_worst(belief.kept, compute_sector_misfits(pixels, p), greatest)
             if searching:
                 continue
             before = p[:2].copy()
             drop_neighbours(belief.kept)
-            if number_of(belief.kept) < _LEAST_SECTORS:
+            if count_kept(belief.kept) < _LEAST_SECTORS:
                 continue
             outcome = settle(setting, p, scale, reach, belief)
             if outcome.status == SETTLED:
-                unscaled = inverse(work)
+                unscaled = compute_inverse(work)
                 for i in range(PARAMETERS):
                     starts.parameters[n, i] = p[i]
                 for i in range(2):
@@ -145,4 +154,4 @@ def _compiled_refit(sources: str) -> Callable[..., None]:
     return refit_all
 
 
-_refit_all = _compiled_refit(digest(pixels, edge_model, newton, sectors))
+_refit_all = _compile_refit(compute_digest(pixels, edge_model, newton, sectors))

@@ -20,7 +20,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.compiled import compiled
 from thermostand.markers.edge_model import (
     B0,
     BLOCK,
@@ -37,9 +36,10 @@ from thermostand.markers.edge_model import (
     Variance,
     X,
     Y,
-    derivatives,
+    compute_derivatives,
     load_block,
 )
+from thermostand.markers.jit import compile_part
 from thermostand.markers.pixels import CORE, DISC, GROUND, Pixels
 
 # Chosen on discs of 17 px (of 3, 4, 6 and 8), judged on radii of 10, 17 and 35 px, other angles and seeds; noise alone
@@ -57,7 +57,7 @@ looked at where the sample is conspicuous (detection.py)."""
 _LEAST_MARKERS = 8
 """With fewer the growth of a frame's variances is a guess."""
 # Less than independent noise is claimed only on twice the evidence, for it makes intervals narrower.
-_DOUBT_OF_LESS = 2.0
+_SHRINKAGE_SIGMAS = 2.0
 _TINY, _ZERO, _ONE, _THREE = np.float32(1e-12), np.float32(0), np.float32(1), np.float32(3)
 
 _MOVED, _TAKEN, _SQUARE = range(3)
@@ -67,14 +67,16 @@ _X, _Y, _G, _H, _E, _PLACE, _THIS, _NEXT, _SEEN = range(9)
 quadrant; its weights in that and in the next; how many rows."""
 
 
-@compiled
-def clusters_of(radius_px: float) -> int:
+@compile_part
+def count_clusters(radius_px: float) -> int:
     """Into how many parts the quadrant is divided: there is a cluster about each end of a part."""
     return int(min(max(0.5 * math.pi * radius_px / _LEAST_ARC_px, _LEAST_CLUSTERS), MOST_CLUSTERS))
 
 
-@compiled
-def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inverse: Float, parts: int) -> Float:
+@compile_part
+def compute_centre_scatter(
+    pixels: Pixels, p: Float, scale: float, noise: Variance, inverse: Float, parts: int
+) -> Float:
     """The cluster-robust variances of cx and cy, px^2, and below them what they would be with independent residuals of
     unit variance, (2, 2). inverse: (J'WJ)^-1. parts: of the quadrant. The second row is less than the diagonal of
     `inverse` by what the fit takes from the residuals of each cluster, by the square of the part of all influence that
@@ -89,10 +91,10 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
             for k in range(size):
                 seen[_X, k], seen[_Y, k] = rows[X, k], rows[Y, k]
             if region == CORE:
-                derivatives(block, size, p, scale, noise)
-                _core_influences(rows, inverse, size, seen)
+                compute_derivatives(block, size, p, scale, noise)
+                _set_core_influences(rows, inverse, size, seen)
             else:
-                _level_influences(rows, p[level : level + 3], noise, inverse[:2, level : level + 3], size, seen)
+                _set_level_influences(rows, p[level : level + 3], noise, inverse[:2, level : level + 3], size, seen)
             _add_block(seen, size, sums)
     variances = np.zeros((2, 2))
     for axis in range(2):
@@ -105,8 +107,8 @@ def centre_scatter(pixels: Pixels, p: Float, scale: float, noise: Variance, inve
     return variances
 
 
-@compiled
-def _core_influences(rows: Single, inverse: Float, size: int, seen: Single) -> None:
+@compile_part
+def _set_core_influences(rows: Single, inverse: Float, size: int, seen: Single) -> None:
     """What pixels near the outline move the centre by, and their residuals, from their derivatives."""
     for k in range(size):
         seen[_G, k], seen[_H, k], seen[_E, k] = _ZERO, _ZERO, rows[ERROR, k]
@@ -117,14 +119,16 @@ def _core_influences(rows: Single, inverse: Float, size: int, seen: Single) -> N
             seen[_H, k] += b * rows[i, k]
 
 
-@compiled
-def _level_influences(rows: Single, plane: Float, noise: Variance, influence: Float, size: int, seen: Single) -> None:
+@compile_part
+def _set_level_influences(
+    rows: Single, plane: Float, noise: Variance, influence: Float, size: int, seen: Single
+) -> None:
     """The same for pixels that see only a plane, by its parameters (3,) and what they move cx and cy by (2, 3)."""
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
-    floor, gain = np.float32(noise[0]), np.float32(noise[1])
+    read_variance, gain = np.float32(noise[0]), np.float32(noise[1])
     for k in range(size):
         model = a + b * seen[_X, k] + c * seen[_Y, k]
-        root = math.sqrt(rows[SHARES, k] / (floor + gain * max(model, _ZERO)))
+        root = math.sqrt(rows[SHARES, k] / (read_variance + gain * max(model, _ZERO)))
         seen[_E, k] = root * (rows[VALUES, k] - model)
         seen[_PLACE, k] = root
     for row, axis in ((_G, CX), (_H, CY)):
@@ -133,7 +137,7 @@ def _level_influences(rows: Single, plane: Float, noise: Variance, influence: Fl
             seen[row, k] = seen[_PLACE, k] * (g + gx * seen[_X, k] + gy * seen[_Y, k])
 
 
-@compiled
+@compile_part
 def _add_block(seen: Single, size: int, sums: Float) -> None:
     """Add pixels to the two clusters of each. It is looked at all the clusters of all pixels, several pixels at a time:
     to add each to its own two, one after the other, takes three times as long."""
@@ -159,7 +163,7 @@ def _add_block(seen: Single, size: int, sums: Float) -> None:
                 sums[axis, row, cluster] += found[row]
 
 
-def variance_ratio(scatter: Float, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
+def compute_variance_ratio(scatter: Float, clean: NDArray[np.bool_]) -> tuple[Float, Float]:
     """The sums over a frame's `clean` (N,) markers of the robust over the independent variances of `scatter`
     (N, 2, 2), NaN for markers that were not looked at, along x and y (2,), and the standard deviations that chance
     gives these ratios (2,). 1 and infinite where the markers are few."""
@@ -172,12 +176,12 @@ def variance_ratio(scatter: Float, clean: NDArray[np.bool_]) -> tuple[Float, Flo
     return ratio, np.sqrt(np.sum((robust - ratio * independent) ** 2, axis=0)) / whole
 
 
-def variance_growth(ratio: Float, chance: Float) -> Float:
-    """By what the variances of a frame's centres grow (2,), along x and y, for a `variance_ratio`.
+def compute_variance_growth(ratio: Float, chance: Float) -> Float:
+    """By what the variances of a frame's centres grow (2,), along x and y, for a `compute_variance_ratio`.
 
     Pulled to 1 where it could be chance (James and Stein): independent noise keeps the covariance that it has. To
     claim less than that takes twice the evidence.
     """
     beyond = ratio - 1
-    doubt = np.where(beyond < 0, _DOUBT_OF_LESS, 1.0) * chance
-    return 1 + beyond * np.maximum(1 - (doubt / np.where(beyond == 0, 1.0, beyond)) ** 2, 0)
+    tolerance = np.where(beyond < 0, _SHRINKAGE_SIGMAS, 1.0) * chance
+    return 1 + beyond * np.maximum(1 - (tolerance / np.where(beyond == 0, 1.0, beyond)) ** 2, 0)

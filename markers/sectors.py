@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.compiled import compiled
 from thermostand.markers.edge_model import CX, CY, Float
+from thermostand.markers.jit import compile_part
 from thermostand.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE, Pixels, U, V
 
 Bools = NDArray[np.bool_]
@@ -22,8 +22,8 @@ _BLOCK = 256
 _PARTS, _TINY, _ONE = np.float32(_QUADRANT), np.float32(1e-12), np.float32(1)
 
 
-@compiled
-def sector(x: np.float32, y: np.float32) -> np.int32:
+@compile_part
+def find_sector(x: np.float32, y: np.float32) -> np.int32:
     """The sector (0..35) of a place relative to the centre. By |y| / (|x| + |y|) within a quadrant: no arc tangent, and
     nearly even. Without branches, so that several pixels are done at a time."""
     part = min(np.int32(_PARTS * abs(y) / (abs(x) + abs(y) + _TINY)), np.int32(_QUADRANT - 1))
@@ -31,16 +31,16 @@ def sector(x: np.float32, y: np.float32) -> np.int32:
     return above if y >= 0 else np.int32(SECTORS - 1) - above
 
 
-@compiled
-def all_kept() -> Bools:
+@compile_part
+def make_all_kept() -> Bools:
     """All sectors (36,)."""
     kept = np.empty(SECTORS, np.bool_)
     kept[:] = True
     return kept
 
 
-@compiled
-def number_of(kept: Bools) -> int:
+@compile_part
+def count_kept(kept: Bools) -> int:
     """How many sectors are kept."""
     number = 0
     for place in range(SECTORS):
@@ -48,30 +48,30 @@ def number_of(kept: Bools) -> int:
     return number
 
 
-@compiled
-def sectors_of(pixels: Pixels, region: int, first: int, p: Float, places: Sectors) -> int:
+@compile_part
+def find_sectors(pixels: Pixels, region: int, first: int, p: Float, places: Sectors) -> int:
     """The sectors of a region's pixels from `first` on, as many as there is room for in `places`; their number."""
     u, v, at = pixels.table[region, U], pixels.table[region, V], np.uint64(first)
     cx, cy = np.float32(p[CX] - pixels.origin[0]), np.float32(p[CY] - pixels.origin[1])
     size = min(len(places), pixels.counts[region] - first)
     for k in range(np.uint64(size)):
-        places[k] = sector(u[at + k] - cx, v[at + k] - cy)
+        places[k] = find_sector(u[at + k] - cx, v[at + k] - cy)
     return size
 
 
-@compiled
-def set_aside(pixels: Pixels, p: Float, kept: Bools) -> None:
+@compile_part
+def mask_sectors(pixels: Pixels, p: Float, kept: Bools) -> None:
     """Give the pixels of sectors that are not `kept` (36,) the share 0."""
     places = np.empty(_BLOCK, np.int32)
     for region in range(3):
         for first in range(0, pixels.counts[region], _BLOCK):
-            for k in range(sectors_of(pixels, region, first, p, places)):
+            for k in range(find_sectors(pixels, region, first, p, places)):
                 if not kept[places[k]]:
                     pixels.table[region, SHARE, first + k] = 0.0
 
 
-@compiled
-def deviations(pixels: Pixels, p: Float) -> Float:
+@compile_part
+def compute_deviations(pixels: Pixels, p: Float) -> Float:
     """What each sector deviates from the model, in standard deviations, (3, 36): its outline (CORE), its levels
     further out and further in (GROUND, DISC). NaN where there are no pixels."""
     found, places = np.empty((3, SECTORS)), np.empty(_BLOCK, np.int32)
@@ -80,7 +80,7 @@ def deviations(pixels: Pixels, p: Float) -> Float:
         share, rise, residual = pixels.table[region, SHARE], pixels.table[region, RISE], pixels.table[region, RESIDUAL]
         sums[:] = 0
         for first in range(0, pixels.counts[region], _BLOCK):
-            for k in range(np.uint64(sectors_of(pixels, region, first, p, places))):
+            for k in range(np.uint64(find_sectors(pixels, region, first, p, places))):
                 at, turn, place = np.uint64(first) + k, k & np.uint64(1), np.uint64(places[k])
                 slope = rise[at] if region == CORE else _ONE
                 sums[turn, place, 0] += share[at] * slope * residual[at]
@@ -91,28 +91,31 @@ def deviations(pixels: Pixels, p: Float) -> Float:
     return found
 
 
-@compiled
-def misfits(pixels: Pixels, p: Float) -> tuple[float, float]:
+@compile_part
+def compute_misfits(pixels: Pixels, p: Float) -> tuple[float, float]:
     """Root mean square over the sectors of the worse of their outlines and their two levels, and of the worse level; 1
     when the noise explains them. Something that hides a part of the marker, or shines on it, shows here long before it
     shows in the residuals of all pixels together."""
-    found = deviations(pixels, p)
-    outline, levels = _mean_square(found[CORE]), max(_mean_square(found[GROUND]), _mean_square(found[DISC]))
+    found = compute_deviations(pixels, p)
+    outline, levels = (
+        _compute_mean_square(found[CORE]),
+        max(_compute_mean_square(found[GROUND]), _compute_mean_square(found[DISC])),
+    )
     return math.sqrt(max(outline, levels)), math.sqrt(levels)
 
 
-@compiled
-def sector_misfits(pixels: Pixels, p: Float) -> Float:
+@compile_part
+def compute_sector_misfits(pixels: Pixels, p: Float) -> Float:
     """How unlike the model each sector (36,) is, in standard deviations: the largest of its deviations, and its
     squared residuals altogether. 0 where no pixel counts."""
     squares, count, places = np.zeros(SECTORS), np.zeros(SECTORS), np.empty(_BLOCK, np.int32)
     for region in range(3):
         share, residual = pixels.table[region, SHARE], pixels.table[region, RESIDUAL]
         for first in range(0, pixels.counts[region], _BLOCK):
-            for k in range(sectors_of(pixels, region, first, p, places)):
+            for k in range(find_sectors(pixels, region, first, p, places)):
                 squares[places[k]] += share[first + k] * residual[first + k] * residual[first + k]
                 count[places[k]] += share[first + k]
-    found, misfits = deviations(pixels, p), np.zeros(SECTORS)
+    found, misfits = compute_deviations(pixels, p), np.zeros(SECTORS)
     for place in range(SECTORS):
         if count[place] > 0:
             misfits[place] = max(0.0, (squares[place] - count[place]) / math.sqrt(2 * count[place]))
@@ -122,8 +125,8 @@ def sector_misfits(pixels: Pixels, p: Float) -> Float:
     return misfits
 
 
-@compiled
-def _mean_square(values: Float) -> float:
+@compile_part
+def _compute_mean_square(values: Float) -> float:
     """Of those that are not NaN, 1 when all are."""
     total, count = 0.0, 0
     for value in values:

@@ -80,7 +80,7 @@ class Target(Document):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_dots(cls, given: object) -> object:
+    def _refuse_corner_boards(cls, given: object) -> object:
         if isinstance(given, dict) and "kind" in given:
             raise ValueError(
                 f"kind: {given['kind']} is a board of squares or tags, which `compensate calibrate-photographs` and "
@@ -89,7 +89,7 @@ class Target(Document):
         return given
 
     @model_validator(mode="after")
-    def _consistent(self) -> Target:
+    def _check_consistent(self) -> Target:
         if self.layout == "square" and self.columns < self.rows:
             raise ValueError(f"columns is the long side, found {self.columns} columns and {self.rows} rows")
         if self.diameter_mm >= self.spacing_mm:

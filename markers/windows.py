@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.markers.bootstrap import Candidates, disc_sizes_px, find_candidates
-from thermostand.markers.grid import DetectionError, Identified, identify, project
+from thermostand.markers.candidate_search import Candidates, find_candidates, iterate_disc_sizes_px
+from thermostand.markers.grid_identification import DetectionError, Identified, identify, project
 from thermostand.markers.noise import Image
 from thermostand.markers.target import Target
 
@@ -18,25 +18,25 @@ for the few tenths of a pixel that heat moves the image, and for the first stage
 Float = NDArray[np.float64]
 
 
-def marker_windows(image: Image, target: Target) -> NDArray[np.int32] | None:
+def find_marker_windows(image: Image, target: Target) -> NDArray[np.int32] | None:
     """The bounding box of each marker with MARGIN_px around it, cut at the image's edges: x, y, width, height in px,
     shape (target.count, 4), marker n at index n - 1. None unless every marker is found. Grey image (height, width)."""
-    for size_px in disc_sizes_px(target, image.shape):
+    for size_px in iterate_disc_sizes_px(target, image.shape):
         try:
             candidates = find_candidates(image, target, size_px)
             identified = identify(candidates, target)
         except (DetectionError, cv2.error, np.linalg.LinAlgError):
             continue
         if (identified.candidate >= 0).all():
-            return _windows(candidates, identified, target, image.shape)
+            return _compute_windows(candidates, identified, target, image.shape)
     return None
 
 
-def _windows(
+def _compute_windows(
     candidates: Candidates, identified: Identified, target: Target, shape: tuple[int, int]
 ) -> NDArray[np.int32]:
     centre = candidates.centres_px[identified.candidate]
-    half = _half_extents_px(identified.homography, target)
+    half = _compute_half_extents_px(identified.homography, target)
     # The shape is the homography's, the size that in the image: the print may be larger than its description.
     half *= np.sqrt(candidates.areas_px2[identified.candidate] / (np.pi * half.prod(axis=1)))[:, None]
     low = np.maximum(np.floor(centre - half - MARGIN_px), 0)
@@ -44,7 +44,7 @@ def _windows(
     return np.concatenate([low, high - low], axis=1).astype(np.int32)
 
 
-def _half_extents_px(homography: Float, target: Target) -> Float:
+def _compute_half_extents_px(homography: Float, target: Target) -> Float:
     """Half width and half height of each marker's outline, (N, 2)."""
     angle = np.arange(64) * (2 * np.pi / 64)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)

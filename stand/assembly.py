@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from thermostand.drivers.devices.kinds import Around, Equipment
+from thermostand.drivers.devices.kinds import DriverContext, Equipment
 from thermostand.drivers.devices.protocols import Controller, Sensor
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
-from thermostand.drivers.devices.thermometers import SeveralModules, Thermometers
+from thermostand.drivers.devices.thermometers import ThermometerModules, Thermometers
 from thermostand.drivers.settings import EquilibriumSettings, OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map
@@ -21,17 +21,24 @@ from thermostand.foundation.hub import Hub
 from thermostand.recording.format.batches import RecordedDevice
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.fault import Fault, Watch
-from thermostand.stand.guarding.channels import ChannelCheck
+from thermostand.stand.guarding.channel_check import ChannelCheck
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import (
     Recording,
-    heat_uncontrolled,
-    intrusion,
+    forbid_intrusion,
+    forbid_uncontrolled_heat,
 )
-from thermostand.stand.guarding.met_errors import MetErrors
-from thermostand.stand.guarding.rules import Announcements, camera_measured, natures, recorded, vital, watches
+from thermostand.stand.guarding.rules import (
+    Announcements,
+    list_vital_channels,
+    make_channel_models,
+    make_watches,
+    watch_camera_temperature,
+    watch_recording,
+)
+from thermostand.stand.guarding.step_errors import StepErrors
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.poller import Poller
 from thermostand.stand.stand import Devices, Stand
@@ -50,7 +57,7 @@ class Assembly:
     equipment: tuple[Equipment, ...]
     channels: ChannelCheck
 
-    def pollers(self) -> tuple[Poller, ...]:
+    def make_pollers(self) -> tuple[Poller, ...]:
         """One per device, in the order in which they are read when several are due at one instant; each module of
         thermometers by itself."""
         polled: list[tuple[Sensor, str, float]] = []
@@ -58,16 +65,16 @@ class Assembly:
             device = self.devices.every[each.name]
             if each.poll_s is None:
                 continue
-            if isinstance(device, SeveralModules):
-                polled += [(module, _named(module, self.config), each.poll_s) for module in device.modules]
+            if isinstance(device, ThermometerModules):
+                polled += [(module, _get_display_name(module, self.config), each.poll_s) for module in device.modules]
             else:
-                polled.append((device, _named(device, self.config), each.poll_s))
+                polled.append((device, _get_display_name(device, self.config), each.poll_s))
         return tuple(
-            Poller(sensor, period_s, self.hub, self.clock, self.channels.marking(named))
+            Poller(sensor, period_s, self.hub, self.clock, self.channels.make_marker(named))
             for sensor, named, period_s in polled
         )
 
-    def guard(
+    def make_guard(
         self,
         stop: Callable[[Fault], None],
         hold: Callable[[Fault], None] | None = None,
@@ -81,18 +88,18 @@ class Assembly:
         From now on nothing is permitted without it."""
         announced, stand = announced or Announcements(), self.stand
         self.hub.subscribe(announced.receive)
-        met = MetErrors(device_kinds(self.config))
+        met = StepErrors(list_device_kinds(self.config))
         self.hub.subscribe(met)
         guard = Guard(
             safety=stand.safety,
             latch=stand.latch,
             watches=(
-                *watches(self.config, announced),
-                Watch(intrusion(lambda: stand.chamber.permits.intrusions), action="hold"),
-                *_obeyed(self.devices.regulator),
+                *make_watches(self.config, announced),
+                Watch(forbid_intrusion(lambda: stand.chamber.permits.intrusions), action="hold"),
+                *_watch_heat_output(self.devices.regulator),
                 *met.watches,
-                *camera_measured(self.config, frames_to_come),
-                *(recorded(self.config, recording) if recording is not None else ()),
+                *watch_camera_temperature(self.config, frames_to_come),
+                *(watch_recording(self.config, recording) if recording is not None else ()),
             ),
             hub=self.hub,
             clock=self.clock,
@@ -101,18 +108,18 @@ class Assembly:
             hold=hold,
             release=release,
             cut_camera=stand.cut_camera,
-            met=met,
-            vital=vital(self.config),
+            step_errors=met,
+            vital=list_vital_channels(self.config),
         )
-        stand.chamber.permits.allowed = guard.may_permit
+        stand.chamber.permits.is_allowed = guard.may_permit
         return guard
 
 
-def _obeyed(regulator: Controller) -> tuple[Watch, ...]:
+def _watch_heat_output(regulator: Controller) -> tuple[Watch, ...]:
     """Of a regulator of our own: that what it heats by obeys its command."""
     if not isinstance(regulator, SoftwareRegulator):
         return ()
-    return (Watch(heat_uncontrolled(lambda: regulator.heat_uncontrolled), action="hold"),)
+    return (Watch(forbid_uncontrolled_heat(lambda: regulator.heat_uncontrolled), action="hold"),)
 
 
 def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
@@ -134,9 +141,9 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
     supply = SupplyLimits(max(boots_s, default=0.0), config.guard.heater_hold_s, equilibrium, channels)
     stand = Stand(devices, chamber, supply, hub, clock)
     if isinstance(regulator := devices.regulator, SoftwareRegulator):
-        regulator.permitted = lambda: stand.chamber.permits.gives
-    check = ChannelCheck(natures(config), config.guard.sensors, hub.publish)
-    stand.imaging.doubt_of = check.doubt_of
+        regulator.is_permitted = lambda: stand.chamber.permits.may_heat
+    check = ChannelCheck(make_channel_models(config), config.guard.sensors, hub.publish)
+    stand.imaging.judge_temperature = check.judge_value
     return Assembly(
         config=config,
         hub=hub,
@@ -151,7 +158,9 @@ def assemble(config: StandConfig, hub: Hub, clock: Clock) -> Assembly:
 
 def _check_limited(config: StandConfig) -> None:
     """ConfigError when guard.channels has what no device measures, or is read too seldom for its limit."""
-    known = [f"{name}.{each.name}" for name, device in recorded_devices(config).items() for each in device.channels]
+    known = [
+        f"{name}.{each.name}" for name, device in list_recorded_devices(config).items() for each in device.channels
+    ]
     polls_s = {each.name: each.poll_s or 0.0 for each in config.equipment}
     for channel, limits in config.guard.channels.items():
         if channel not in known:
@@ -169,14 +178,14 @@ def make_devices(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> Devic
     """Every device of the stand's file, not opened; ConfigError when a register map is missing or wrong, or that of
     another kind of unit."""
     made: dict[str, Sensor] = {}
-    around = Around(
+    around = DriverContext(
         clock=clock,
         bus=bus,
         made=made,
         publish=hub.publish,
         known=hub.known,
         of_section=partial(getattr, config),
-        map_of=register_map,
+        map_of=load_unit_map,
     )
     by_kind: dict[str, dict[str, Any]] = {}
     # What controls comes last: it may heat by another device.
@@ -191,30 +200,30 @@ def make_devices(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> Devic
     )
 
 
-def _named(sensor: Sensor, config: StandConfig) -> str:
+def _get_display_name(sensor: Sensor, config: StandConfig) -> str:
     """What a device with several temperatures is called, so that it is found."""
     if not isinstance(sensor, Thermometers):
         return sensor.name
     return f"{sensor.name} (unit {sensor.unit} at {config.bus.address})"
 
 
-def device_kinds(config: StandConfig) -> dict[str, str]:
+def list_device_kinds(config: StandConfig) -> dict[str, str]:
     """What the stand is made of: name -> kind, but for what is in the place of a device and never read."""
     return {each.name: each.kind.name for each in config.equipment if each.poll_s is not None}
 
 
-def recorded_devices(config: StandConfig) -> dict[str, RecordedDevice]:
+def list_recorded_devices(config: StandConfig) -> dict[str, RecordedDevice]:
     """What is recorded of each device that is read, by name; ConfigError when one declares what cannot be recorded."""
     return {
         each.name: RecordedDevice(
-            each.kind.name, each.channels(partial(getattr, config), register_map), each.kind.is_opened
+            each.kind.name, each.channels(partial(getattr, config), load_unit_map), each.kind.is_opened
         )
         for each in config.equipment
         if each.poll_s is not None
     }
 
 
-def register_map(key: str, unit: OnBus) -> RegisterMap:
+def load_unit_map(key: str, unit: OnBus) -> RegisterMap:
     """The map of a unit, for its number on the bus; ConfigError when it is missing or wrong."""
-    path = packaged("registers", unit.registers, key=f"{key}.registers")
+    path = find_packaged("registers", unit.registers, key=f"{key}.registers")
     return load_register_map(path).at_unit(unit.unit)

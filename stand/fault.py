@@ -9,8 +9,8 @@ from typing import Literal, Protocol
 
 from pydantic import JsonValue
 
-from thermostand.foundation.clock import seconds_ns
-from thermostand.foundation.events import guard_kind
+from thermostand.foundation.clock import to_ns
+from thermostand.foundation.events import get_guard_kind
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
 
@@ -60,9 +60,9 @@ class Fault:
         compared: dict[str, JsonValue] = {"channels": list(self.channels), "suspect": self.suspect}
         return {"action": self.action, "ends_itself": self.ends_itself, **(compared if self.channels else {})}
 
-    def at(self, time_ns: int) -> Event:
+    def make_event(self, time_ns: int) -> Event:
         """That the rule objects, as an event."""
-        return guard_kind(self.rule).at(time_ns, self.text, rule=self.rule, **self.data)
+        return get_guard_kind(self.rule).at(time_ns, self.text, rule=self.rule, **self.data)
 
 
 Rule = Callable[[Readings, int], Fault | None]
@@ -93,20 +93,20 @@ class Watch:
             return None
         if self.since_ns is None:
             self.since_ns = now_ns
-        if now_ns - self.since_ns < seconds_ns(self.grace_s):
+        if now_ns - self.since_ns < to_ns(self.grace_s):
             return None
         lasting = f", for {self.grace_s:g} s" if self.grace_s > 0 else ""
         return replace(fault, text=fault.text + lasting, action=self.action, ends_itself=self.ends_itself)
 
 
-def value_of(readings: Readings, channel: str) -> float:
-    """The last known value, over polls that failed on the wire: whether it is too old is the business of `trustworthy`.
+def get_value(readings: Readings, channel: str) -> float:
+    """The last known value, over polls that failed on the wire: whether it is too old, `require_fresh_reading` judges.
     NaN when the device says itself that it has none, or it was never read, and every comparison with that is false."""
     reading = readings.known(channel)
     return math.nan if reading is None else reading.value
 
 
-def in_doubt(readings: Readings, channel: str) -> bool:
+def is_suspect(readings: Readings, channel: str) -> bool:
     """Whether its last value is not to be believed."""
     reading = readings.known(channel)
     return reading is not None and reading.cause == "doubt"

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from enum import StrEnum
 
-from thermostand.foundation.events import CAMERA_ENDS, DISK, RESET_ADVICE, ROOM, Alert, event
+from thermostand.foundation.events import CAMERA_ENDS, DISK, DISK_SPACE_ADVICE, RESET_ADVICE, Alert, event
 
 Listener = Callable[[str, bool], None]
 
@@ -19,7 +19,7 @@ NOT_RECORDED = "not_recorded"  # until the disk takes telemetry again
 STOPPING = "stopping"  # the run is being ended; cleared when it is over
 
 # The same in words, for people.
-IN_WORDS = {
+REASON_TEXTS = {
     OPERATOR: "an operator's pause",
     INTERLOCK: "a rule of the guard",
     CAMERA_LOST: "a camera that does not answer",
@@ -32,13 +32,13 @@ ENDINGS = {
     OPERATOR: "`stand continue` ends the pause",
     INTERLOCK: RESET_ADVICE,
     CAMERA_LOST: CAMERA_ENDS,
-    DISK_LOW: ROOM,
+    DISK_LOW: DISK_SPACE_ADVICE,
     NOT_RECORDED: DISK,
 }
 HELD = event(
     "held",
     "warning",
-    "held by {said}",
+    "held by {text}",
     # What the guard says of its rule tells how that ends.
     lambda data: (ENDINGS | {INTERLOCK: ""}).get(str(data.get("reason"))) or _STATUS,
     counts=True,
@@ -47,7 +47,7 @@ HELD = event(
 RELEASED = event(
     "released",
     "info",
-    "no longer held by {said}",
+    "no longer held by {text}",
     alert=lambda data: Alert("hold", "guard", "over") if data.get("reason") == INTERLOCK else None,
     counts=True,
     cases=({"reason": INTERLOCK}, {"reason": OPERATOR}),
@@ -72,7 +72,7 @@ class Gate:
         """Call `listener(reason, held)` at once when a reason appears (held) or goes."""
         self._listeners.append(listener)
 
-    def let_go(self) -> None:
+    def remove_listeners(self) -> None:
         """Forget the listeners: the run they belong to has ended."""
         self._listeners.clear()
 
@@ -82,7 +82,7 @@ class Gate:
             self._reasons.add(reason)
             self._open.clear()
             self._closed.set()
-            self._tell(reason, True)
+            self._notify_listeners(reason, True)
 
     def clear(self, reason: str) -> None:
         """Take `reason` back; the gate opens with the last one."""
@@ -91,18 +91,18 @@ class Gate:
             if not self._reasons:
                 self._closed.clear()
                 self._open.set()
-            self._tell(reason, False)
+            self._notify_listeners(reason, False)
 
-    async def passed(self) -> None:
+    async def wait_until_open(self) -> None:
         """Return when the gate is open."""
         while self._reasons:  # it may have closed again before we came to run
             await self._open.wait()
 
-    async def closed(self) -> None:
+    async def wait_until_closed(self) -> None:
         """Return when the gate has closed, be it for a moment."""
         await self._closed.wait()
 
-    def _tell(self, reason: str, held: bool) -> None:
+    def _notify_listeners(self, reason: str, held: bool) -> None:
         for listener in tuple(self._listeners):
             listener(reason, held)
 
@@ -146,6 +146,6 @@ _NEXT: dict[Phase, dict[PhaseTurn, Phase]] = {
 }
 
 
-def next_phase(phase: Phase, turn: PhaseTurn) -> Phase:
+def get_next_phase(phase: Phase, turn: PhaseTurn) -> Phase:
     """The phase after `turn`."""
     return _NEXT[phase].get(turn, phase)

@@ -72,7 +72,7 @@ class Latch:
         if failure:
             self._hub.publish(LATCH_NOT_KEPT.at(now_ns, failure))
 
-    def bar(self) -> None:
+    def hold_gate(self) -> None:
         """What has tripped holds the gate, unless nothing has."""
         if self.fault is not None:
             self._gate.hold(INTERLOCK)
@@ -82,13 +82,13 @@ class Latch:
         found = None if self.file is None else await asyncio.to_thread(self.file.read)
         if found is not None:
             self.fault, self.since_ns = Fault(found.rule, found.text, "hold"), found.since_ns
-            self.bar()
+            self.hold_gate()
 
     def reset(self) -> None:
         """Nothing has tripped any more, and the gate is let go; the disk is waited for as by `trip`."""
         self.fault = None
         self._gate.clear(INTERLOCK)
-        if self.file is not None and (failure := self.file.forget()):
+        if self.file is not None and (failure := self.file.remove()):
             self._hub.publish(LATCH_NOT_RESET.at(self._clock.now_ns(), failure))
 
 
@@ -98,31 +98,33 @@ class LatchFile:
     def __init__(self, paths: Iterable[Path]) -> None:
         self._paths = tuple(paths)
         self._turn = threading.Lock()
-        self.run: Callable[..., object] = _here
+        self.run: Callable[..., object] = _call_directly
         """Calls a function with its arguments where a disk may hang."""
 
     @classmethod
-    def at(cls, names: Iterable[str]) -> LatchFile:
+    def for_addresses(cls, names: Iterable[str]) -> LatchFile:
         """In this computer's folder, by the names of the addresses of what heats and cools."""
-        folder, names = state_folder(), tuple(names)
+        folder, names = find_state_folder(), tuple(names)
         return cls(folder / f"{name}{end}" for end in _ENDS for name in names)
 
     def read(self) -> LatchedFault | None:
         """The fault that nobody has reset; None when there is none."""
         found: list[LatchedFault | None] = []
-        reading = threading.Thread(target=lambda: found.append(_read(self._paths)), name="stand-latch", daemon=True)
+        reading = threading.Thread(
+            target=lambda: found.append(_read_latch(self._paths)), name="stand-latch", daemon=True
+        )
         reading.start()
         reading.join(_READ_WITHIN_S)
-        return found[0] if found else _unreadable(self._paths[0], "the disk has not answered")
+        return found[0] if found else _make_unreadable_fault(self._paths[0], "the disk has not answered")
 
     def keep(self, fault: Fault, since_ns: int) -> str:
         """Write it; "" when it is on the disk, else why it is not known to be."""
         text = LatchedFault(rule=fault.rule, text=fault.text, since_ns=since_ns).model_dump_json(indent=1)
-        return self._bounded(_write, seal(_KIND, text))
+        return self._run_within_limit(_write, seal(_KIND, text))
 
-    def forget(self) -> str:
+    def remove(self) -> str:
         """An operator has reset it; as `keep`."""
-        return self._bounded(_remove)
+        return self._run_within_limit(_remove)
 
     def reset(self) -> None:
         """As `forget`, however long it takes; SessionError when a file cannot be removed: the stand stays latched."""
@@ -133,7 +135,7 @@ class LatchFile:
                 f"{error.filename}: cannot be removed ({error.strerror}), so the stand stays latched; remove it by hand"
             ) from error
 
-    def _bounded(self, function: Callable[..., object], *arguments: object) -> str:
+    def _run_within_limit(self, function: Callable[..., object], *arguments: object) -> str:
         failure: list[str] = []
 
         def work() -> None:
@@ -152,7 +154,7 @@ class LatchFile:
         return "the disk has not answered" if thread.is_alive() else "".join(failure)
 
 
-def state_folder() -> Path:
+def find_state_folder() -> Path:
     """`/var/lib/thermostand` where `stand service install` has made it, for every operator's program; else
     `$XDG_STATE_HOME/thermostand`, by default below `~/.local/state`."""
     if SYSTEM_FOLDER.is_dir():
@@ -161,34 +163,34 @@ def state_folder() -> Path:
     return (given if given.is_absolute() else Path.home() / ".local" / "state") / "thermostand"
 
 
-def _here(function: Callable[..., object], *arguments: object) -> object:
+def _call_directly(function: Callable[..., object], *arguments: object) -> object:
     return function(*arguments)
 
 
-def _read(paths: tuple[Path, ...]) -> LatchedFault | None:
+def _read_latch(paths: tuple[Path, ...]) -> LatchedFault | None:
     for path in paths:
         try:
             found = path.lstat()
         except FileNotFoundError:
             continue
         except OSError as error:
-            return _unreadable(path, error.strerror)
+            return _make_unreadable_fault(path, error.strerror)
         if not stat.S_ISREG(found.st_mode):
-            return _unreadable(path, "it is no file")
+            return _make_unreadable_fault(path, "it is no file")
         if found.st_size > _LONGEST_BYTES:
-            return _unreadable(path, "it is too long")
+            return _make_unreadable_fault(path, "it is too long")
         try:
             return LatchedFault.model_validate_json(unseal(_KIND, path.read_bytes()))
         except OSError as error:
-            return _unreadable(path, error.strerror)
+            return _make_unreadable_fault(path, error.strerror)
         except ValueError:
-            return _unreadable(path, "it is damaged")
+            return _make_unreadable_fault(path, "it is damaged")
     # Nothing was said yet of a fault whose file was not renamed; but it was found.
-    begun = next((each for path in paths for each in _begun(path)), None)
-    return None if begun is None else _unreadable(begun, "the program that wrote it was killed")
+    begun = next((each for path in paths for each in _find_partial_files(path)), None)
+    return None if begun is None else _make_unreadable_fault(begun, "the program that wrote it was killed")
 
 
-def _begun(path: Path) -> Iterator[Path]:
+def _find_partial_files(path: Path) -> Iterator[Path]:
     """What a program that was killed in `replace_file` has left beside it."""
     return path.parent.glob(f".{path.name}.*.part")
 
@@ -199,7 +201,7 @@ def _write(paths: tuple[Path, ...], data: bytes) -> None:
 
 
 def _remove(paths: tuple[Path, ...]) -> None:
-    for path in chain(paths, *map(_begun, paths)):
+    for path in chain(paths, *map(_find_partial_files, paths)):
         try:
             if path.is_dir() and not path.is_symlink():
                 path.rmdir()
@@ -211,6 +213,6 @@ def _remove(paths: tuple[Path, ...]) -> None:
             sync_folder(path.parent)
 
 
-def _unreadable(path: Path, why: str | None) -> LatchedFault:
+def _make_unreadable_fault(path: Path, why: str | None) -> LatchedFault:
     text = f"{path} says whether this stand has tripped, and cannot be read ({why}); look at the stand, then reset it"
     return LatchedFault(rule=UNREADABLE, text=text, since_ns=0)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from thermostand.drivers.devices.protocols import Sensor
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.errors import DeviceError
 from thermostand.foundation.events import DEVICE_BACK, DEVICE_FAST, DEVICE_LOST, DEVICE_SLOW
 from thermostand.foundation.hub import Hub
@@ -50,7 +50,7 @@ class Poller:
         """Poll until cancelled."""
         due_ns = self.clock.now_ns()
         while True:
-            period_ns = seconds_ns(min(self.period_s, _AGAIN_S) if self._ask_again else self.period_s)
+            period_ns = to_ns(min(self.period_s, _AGAIN_S) if self._ask_again else self.period_s)
             due_ns = max(due_ns + period_ns, self.clock.now_ns())  # a late poll is not made up for by a burst
             await self.clock.sleep_until(due_ns)
             await self.poll()
@@ -61,10 +61,10 @@ class Poller:
         try:
             readings = await self.sensor.read()
         except DeviceError as error:
-            self._lost(error)
+            self._publish_loss(error)
             return
         self._ask_again = False
-        self._time(self.clock.now_ns() - begin_ns)
+        self._check_duration(self.clock.now_ns() - begin_ns)
         if self._failing:
             self._failing = False
             now_ns, name = self.clock.now_ns(), self.sensor.name
@@ -72,9 +72,9 @@ class Poller:
             self.hub.publish(DEVICE_BACK.at(now_ns, device=name, lost_s=lost_s))
         self._publish(readings)
 
-    def _time(self, took_ns: int) -> None:
+    def _check_duration(self, took_ns: int) -> None:
         """Of one read that succeeded."""
-        is_slow = took_ns > seconds_ns(self.period_s / 2 if self._is_slow else self.period_s)
+        is_slow = took_ns > to_ns(self.period_s / 2 if self._is_slow else self.period_s)
         if is_slow == self._is_slow:
             return
         self._is_slow = is_slow
@@ -88,7 +88,7 @@ class Poller:
         readings = self._known = self.mark(readings, self.clock.now_ns())
         self.hub.publish(Batch(self.sensor.name, self.clock.now_ns(), readings))
 
-    def _lost(self, error: DeviceError) -> None:
+    def _publish_loss(self, error: DeviceError) -> None:
         now_ns, reason = self.clock.now_ns(), str(error)
         self._ask_again = error.retryable
         cause: Cause = "wire" if error.retryable else "device"

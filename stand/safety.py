@@ -11,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import GarbledReply, Unreachable
 from thermostand.foundation.events import CONFIRMED_SAFE, NOT_CONFIRMED_SAFE
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.tasks import first_of
+from thermostand.foundation.tasks import wait_for_first
 
 # Below the 15 s of the relay board's own timer.
 TRY_LIMIT_S = 10.0  # real seconds of one try; the dead-man relay drops by itself after that
@@ -24,7 +24,7 @@ _REPORTED_AFTER_S = 60.0  # round number; nothing was measured
 _GIVEN_UP_AFTER_S = 60.0  # before that, a second signal does not end it
 
 
-class Harmful(Protocol):
+class SafetyActuator(Protocol):
     """What of an actuator is needed here."""
 
     @property
@@ -47,13 +47,13 @@ class Pending:
     failure: str
 
 
-class _Maker:
+class _SafeStateTask:
     """Makes one actuator safe as often as it is demanded, and until it confirms.
 
     A demand is met by a call that begins after it: one under way may already have passed what a verb commands now.
     """
 
-    def __init__(self, actuator: Harmful, pause_s: float, clock: Clock, changed: Callable[[], None]) -> None:
+    def __init__(self, actuator: SafetyActuator, pause_s: float, clock: Clock, changed: Callable[[], None]) -> None:
         self.failure = ""  # why the last try did not confirm
         self.demanded = self.begun = self.tried = self.confirmed = 0
         self._since_ns = 0  # when the first demand was made that is not confirmed
@@ -80,7 +80,7 @@ class _Maker:
         is_confirmed = self.confirmed == self.demanded
         return None if is_confirmed else Pending(self._actuator.name, self._since_ns, self.failure)
 
-    def forgive(self) -> None:
+    def cancel(self) -> None:
         """An operator has taken over: what is not confirmed yet is tried no more."""
         if self._task is not None:
             self._task.cancel()
@@ -102,7 +102,7 @@ class _Maker:
                 self.confirmed = demand
             self._changed()
             if self.failure:
-                await self._paused()
+                await self._pause()
 
     async def _try(self) -> str:
         """Why it is not confirmed, "" when it is; a lost answer is worth a second call at once."""
@@ -117,10 +117,10 @@ class _Maker:
             return f"{name} did not confirm its safe state: {str(error) or 'no answer in time'}"
         return ""
 
-    async def _paused(self) -> None:
+    async def _pause(self) -> None:
         """Until the next try is due, or demanded."""
-        due_ns = self._clock.now_ns() + seconds_ns(self._pause_s)
-        await first_of(self._clock.sleep_until(due_ns), self._demand.wait())
+        due_ns = self._clock.now_ns() + to_ns(self._pause_s)
+        await wait_for_first(self._clock.sleep_until(due_ns), self._demand.wait())
 
 
 class Safety:
@@ -131,12 +131,12 @@ class Safety:
     """
 
     def __init__(self, revoke: Callable[[], None], hub: Hub, clock: Clock) -> None:
-        self._makers: tuple[_Maker, ...] = ()
-        self._until_cleared: dict[Harmful, _Maker] = {}
+        self._makers: tuple[_SafeStateTask, ...] = ()
+        self._until_cleared: dict[SafetyActuator, _SafeStateTask] = {}
         self._revoke = revoke
         self._hub = hub
         self._clock = clock
-        self._reported: dict[_Maker, str] = {}
+        self._reported: dict[_SafeStateTask, str] = {}
         self._changed = asyncio.Event()  # set, and replaced, when something was tried
         self._unsafe_since_ns: int | None = None
         self._given_up = False
@@ -164,12 +164,12 @@ class Safety:
         for maker in self._makers:
             maker.demand()
 
-    def take(self, actuator: Harmful, pause_s: float = _PAUSE_S) -> None:
+    def take(self, actuator: SafetyActuator, pause_s: float = _PAUSE_S) -> None:
         """From now on this actuator, too, is made safe with each demand, and again after `pause_s` while it does not
         confirm."""
-        self._makers = (*self._makers, _Maker(actuator, pause_s, self._clock, self._on_change))
+        self._makers = (*self._makers, _SafeStateTask(actuator, pause_s, self._clock, self._on_change))
 
-    def take_until_cleared(self, actuator: Harmful) -> None:
+    def add_until_cleared(self, actuator: SafetyActuator) -> None:
         """As `take`, until an operator resets the hold."""
         if actuator not in self._until_cleared:
             self.take(actuator)
@@ -179,45 +179,45 @@ class Safety:
         """An operator does not want to wait for the confirmation any more: whether that ends the wait, as it does from
         a minute after the demand on."""
         since_ns = self._unsafe_since_ns
-        late = since_ns is not None and self._clock.now_ns() - since_ns >= seconds_ns(_GIVEN_UP_AFTER_S)
+        late = since_ns is not None and self._clock.now_ns() - since_ns >= to_ns(_GIVEN_UP_AFTER_S)
         if late and not self._given_up:
             self._given_up = True
             self._on_change()
         return self._given_up
 
-    def renew(self) -> None:
+    def reset_give_up(self) -> None:
         """Who did not want to wait for one confirmation may want to for the next."""
         self._given_up = False
 
-    def forgive(self) -> None:
+    def cancel_pending(self) -> None:
         """An operator has reset the hold: what is not confirmed is tried no more, or it would undo what the run does
         from now on."""
         for maker in self._makers:
-            maker.forgive()
+            maker.cancel()
         self._makers = tuple(maker for maker in self._makers if maker not in self._until_cleared.values())
         self._until_cleared.clear()
         self._on_change()
 
-    async def tried(self) -> None:
+    async def wait_until_tried(self) -> None:
         """Return when every actuator has been tried once since the last demand, with or without success."""
         while any(maker.tried < maker.demanded for maker in self._makers):
             await self._changed.wait()
 
-    async def settled(self) -> None:
+    async def wait_until_settled(self) -> None:
         """Return when everything is confirmed, or an operator has given up."""
-        await self.tried()
+        await self.wait_until_tried()
         while not (self.is_confirmed or self._given_up):
             await self._changed.wait()
 
-    async def confirmed(self, limit_s: float) -> bool:
+    async def wait_until_confirmed(self, limit_s: float) -> bool:
         """Whether everything is confirmed within that time, on the stand's clock, and before an operator gives up; an
         event says what is not, after a minute and then each time in twice as long."""
-        end_ns, wait_s = self._clock.now_ns() + seconds_ns(limit_s), _REPORTED_AFTER_S
-        await self.tried()
+        end_ns, wait_s = self._clock.now_ns() + to_ns(limit_s), _REPORTED_AFTER_S
+        await self.wait_until_tried()
         while not self.is_confirmed and not self._given_up and self._clock.now_ns() < end_ns:
-            due_ns = min(end_ns, self._clock.now_ns() + seconds_ns(wait_s))
+            due_ns = min(end_ns, self._clock.now_ns() + to_ns(wait_s))
             wait_s *= 2.0
-            if not await self._changes_before(due_ns) and not self.is_confirmed:
+            if not await self._wait_for_change(due_ns) and not self.is_confirmed:
                 text, unconfirmed = f"still trying: {'; '.join(self.unconfirmed)}", list(self.unconfirmed)
                 self._hub.publish(NOT_CONFIRMED_SAFE.at(self._clock.now_ns(), text, unconfirmed=unconfirmed))
         return self.is_confirmed
@@ -226,7 +226,7 @@ class Safety:
         """Try no more; may be called twice."""
         await asyncio.gather(*(maker.close() for maker in self._makers))
 
-    async def _changes_before(self, due_ns: int) -> bool:
+    async def _wait_for_change(self, due_ns: int) -> bool:
         """Wait for the confirmation, or for an operator to give up, until then."""
         sleeping = asyncio.ensure_future(self._clock.sleep_until(due_ns))
         try:
@@ -239,13 +239,13 @@ class Safety:
             sleeping.cancel()
 
     def _on_change(self) -> None:
-        self._tell()
+        self._report()
         if self.is_confirmed:
             self._unsafe_since_ns = None
         self._changed.set()
         self._changed = asyncio.Event()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         """Each new reason, and the end of the last one."""
         for maker in self._makers:
             if maker.failure and self._reported.get(maker) != maker.failure:

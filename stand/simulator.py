@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping
 
 from thermostand.drivers.camera_preset import CameraPreset
 from thermostand.drivers.devices.kinds import Equipment
-from thermostand.foundation.addresses import state_as, tcp_place
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.addresses import parse_tcp_address, set_display_address
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError, Refused, Unreachable
 from thermostand.stand.config.simulation import SimulatedCamera
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 _STOP_LIMIT_S = 5.0  # round number; nothing was measured
 _CONNECT_S = 5.0
@@ -27,7 +27,7 @@ _CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less
 _FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"
 
 
-def laboratory_of(
+def describe_laboratory(
     config: StandConfig, *, virtual: bool, seed: int | None, start_ns: int | None = None, is_anywhere: bool = False
 ) -> dict[str, object]:
     """The simulator's description: which fake answers where, or `is_anywhere`: each at a free address of the same kind.
@@ -47,7 +47,7 @@ def laboratory_of(
     return {
         "virtual": virtual,
         "control": address_of(simulation.control),
-        "start_ns": seconds_ns(simulation.start.timestamp()) if start_ns is None else start_ns,
+        "start_ns": to_ns(simulation.start.timestamp()) if start_ns is None else start_ns,
         "seed": simulation.seed if seed is None else seed,
         "camera_kind": simulation.camera,
         "laboratory_degC": simulation.laboratory_degC,
@@ -55,7 +55,7 @@ def laboratory_of(
         "faults": list(simulation.faults),
         "bus": address_of(config.bus.address),
         "devices": {
-            each.name: {"fake": fake, "settings": _settings_of(each, config, address_of, is_anywhere=is_anywhere)}
+            each.name: {"fake": fake, "settings": _make_settings(each, config, address_of, is_anywhere=is_anywhere)}
             for each in config.equipment
             if each.settings is not None and (fake := each.kind.fake(each.settings))
         },
@@ -63,13 +63,13 @@ def laboratory_of(
     }
 
 
-def _settings_of(
+def _make_settings(
     each: Equipment, config: StandConfig, address_of: Callable[[str | None], str | None], *, is_anywhere: bool
 ) -> dict[str, object]:
     """As the stand's file has them, with the address at which the fake is to answer, and what it needs of the rest."""
     name, kind, settings = each
     if kind.section == "cameras":
-        dress = _dress_of(config.simulation.cameras.get(name, SimulatedCamera())) if config.simulation else {}
+        dress = _describe_camera(config.simulation.cameras.get(name, SimulatedCamera())) if config.simulation else {}
         address = None if is_anywhere else settings.address
         return {"address": address, "serial_number": settings.serial_number, **dress}
     data: dict[str, object] = settings.model_dump(mode="json")
@@ -84,12 +84,12 @@ def _settings_of(
     return data
 
 
-def _dress_of(camera: SimulatedCamera) -> dict[str, object]:
+def _describe_camera(camera: SimulatedCamera) -> dict[str, object]:
     """Optics and the GenICam file, the latter from where we are. ConfigError where the optics' file cannot be read."""
     genicam = None if camera.genicam is None else str(camera.genicam.resolve())
     if not camera.is_preset:
         return {"optics": camera.optics, "genicam": genicam}
-    preset = load_document(packaged("optics", str(camera.optics)), CameraPreset)
+    preset = load_document(find_packaged("optics", str(camera.optics)), CameraPreset)
     return {
         "preset": preset.model_dump(),
         "effects": list(camera.effects),
@@ -98,7 +98,7 @@ def _dress_of(camera: SimulatedCamera) -> dict[str, object]:
     }
 
 
-def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
+def relocate(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     """The same stand with every device of its simulated laboratory at these addresses (Simulator.addresses), of which
     messages say what the file of `config` states."""
     moved = {
@@ -108,9 +108,9 @@ def relocated(config: StandConfig, addresses: Mapping[str, str]) -> StandConfig:
     }
     for name, kind, settings in config.equipment:
         if name in moved and (address := getattr(settings, kind.address_key)):
-            state_as(addresses[name], address)
-    state_as(addresses["bus"], config.bus.address)
-    update = config.sections_with(moved) | {"bus": config.bus.model_copy(update={"address": addresses["bus"]})}
+            set_display_address(addresses[name], address)
+    set_display_address(addresses["bus"], config.bus.address)
+    update = config.replace_settings(moved) | {"bus": config.bus.model_copy(update={"address": addresses["bus"]})}
     simulation = config.simulation
     update["simulation"] = simulation and simulation.model_copy(update={"control": addresses["control"]})
     return config.model_copy(update=update)
@@ -171,7 +171,7 @@ class ControlSocket:
     comes within a ms; the event loop has its turn every 10 ms of one that takes longer."""
 
     def __init__(self, address: str) -> None:
-        self._place = tcp_place(address)
+        self._place = parse_tcp_address(address)
         self._socket: socket.socket | None = None
 
     async def open(self) -> None:
@@ -188,7 +188,7 @@ class ControlSocket:
 
     async def request(self, request: Mapping[str, object]) -> dict[str, object]:
         """Send one request and return its answer; Unreachable when the simulator is gone, Refused when it refuses."""
-        return _accepted(await self._answer(json.dumps(request).encode() + b"\n"))
+        return _parse_answer(await self._answer(json.dumps(request).encode() + b"\n"))
 
     async def _answer(self, line: bytes) -> bytes:
         """The line that answers; Unreachable."""
@@ -198,12 +198,12 @@ class ControlSocket:
             self._socket.sendall(line)
             answer = b""
             while not answer.endswith(b"\n"):
-                answer += await self._received(self._socket)
+                answer += await self._receive(self._socket)
         except OSError as error:
             raise Unreachable("simulator", f"the control socket broke ({error})") from error
         return answer
 
-    async def _received(self, opened: socket.socket) -> bytes:
+    async def _receive(self, opened: socket.socket) -> bytes:
         while True:
             try:
                 data = opened.recv(65536)
@@ -218,7 +218,7 @@ class ControlSocket:
         """Put the simulated laboratory at `now_ns`; raises as `request`."""
         line = await self._answer(b'{"do": "advance", "now_ns": %d}\n' % now_ns)
         if line != b'{"now_ns": %d}\n' % now_ns:
-            _accepted(line)
+            _parse_answer(line)
 
     async def close(self) -> None:
         """Let go; may be called twice."""
@@ -227,7 +227,7 @@ class ControlSocket:
         self._socket = None
 
 
-def _accepted(line: bytes) -> dict[str, object]:
+def _parse_answer(line: bytes) -> dict[str, object]:
     """What the simulator answered; Refused when it refuses."""
     answer: dict[str, object] = json.loads(line)
     if "error" in answer:

@@ -12,7 +12,7 @@ from thermostand.drivers.devices.motion.stage import Axis
 from thermostand.drivers.devices.probes import Probe
 from thermostand.drivers.devices.protocols import Actuator, Camera, Controller, Sensor, Shutter, Switches
 from thermostand.drivers.devices.regulators.heat_module import HeatModule
-from thermostand.drivers.devices.thermometers import SeveralModules, Thermometers
+from thermostand.drivers.devices.thermometers import ThermometerModules, Thermometers
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.events import PROMPT, PROMPT_SKIPPED
 from thermostand.foundation.hub import Hub
@@ -50,9 +50,9 @@ class Devices:
         return cast("Switches", self.every["relays"])
 
     @property
-    def thermometers(self) -> Thermometers | SeveralModules:
+    def thermometers(self) -> Thermometers | ThermometerModules:
         """The contact thermometers."""
-        return cast("Thermometers | SeveralModules", self.every["thermometers"])
+        return cast("Thermometers | ThermometerModules", self.every["thermometers"])
 
     @property
     def flap(self) -> Shutter:
@@ -134,7 +134,7 @@ class Stand:
         """The camera itself is too warm: its supply goes off, too, whenever the stand is made safe, until an operator
         resets the hold."""
         self.imaging.supply.is_on = False
-        self.safety.take_until_cleared(self.imaging.supply)
+        self.safety.add_until_cleared(self.imaging.supply)
         self.safety.demand()
 
     async def prompt(self, text: str) -> None:
@@ -144,5 +144,5 @@ class Stand:
         self._hub.publish(PROMPT.at(self._clock.now_ns(), what=text, attended=self.attended))
         if self.attended:
             self.gate.hold(OPERATOR)
-            return await self.gate.passed()
+            return await self.gate.wait_until_open()
         self._hub.publish(PROMPT_SKIPPED.at(self._clock.now_ns(), what=text))

@@ -51,7 +51,7 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
     return residual
 
 
-async def ready(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: Hub, clock: Clock) -> None:
+async def prepare_axes(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: Hub, clock: Clock) -> None:
     """Before a capture: approach again, from below, each axis whose position cannot be relied upon.
 
     `commanded`: where the plan put each axis it moved (mm or deg); the others are left alone. An axis is in doubt when
@@ -84,7 +84,7 @@ class Table:
         self._clock = clock
         self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
 
-    def forget(self) -> None:
+    def forget_positions(self) -> None:
         """No plan has put any stage anywhere: the run that did is over."""
         self._commanded.clear()
 
@@ -119,7 +119,7 @@ class Table:
         """Before frames: approach again, from below, each stage whose motor has been switched off since its move."""
         self._interlock.check()
         with self._motions.under_way("stages", "back to the plan's positions, where they are elsewhere"):
-            await ready(self._axes, self._commanded, self._hub, self._clock)
+            await prepare_axes(self._axes, self._commanded, self._hub, self._clock)
 
     def _axis(self, axis: str) -> Axis:
         self._interlock.check()

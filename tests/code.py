@@ -1,4 +1,5 @@
-"""`python -m tests.code CODE ARGUMENT ...` is as `python -c CODE ARGUMENT ...`, and may be forked (tests/forked.py)."""
+"""`python -m tests.code CODE ARGUMENT ...` is as `python -c CODE ARGUMENT ...`, and may be forked: see
+tests/fork_server.py."""
 
 import sys
 

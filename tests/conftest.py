@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, settings
 # Before NumPy is loaded: as the commands and `make test` have it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from tests import forked
-from tests.forked import STARTERS, Forks, Programs
+from tests import fork_server
+from tests.fork_server import STARTERS, Forks, Programs
 from tests.stock_camera import run_stock_camera
 from tests.workers import run_units
 from thermostand.recording.writing import notices
@@ -86,21 +86,21 @@ def _own_state(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
 @pytest.fixture(scope="session", autouse=True)
 def _roomy_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """How full this machine's disk is adds no event to what is recorded; a test's own small disks are as they are."""
-    own_device, ask = tmp_path_factory.getbasetemp().stat().st_dev, notices.disk_space
+    own_device, ask = tmp_path_factory.getbasetemp().stat().st_dev, notices.read_disk_space
 
     def roomy(folder: Path) -> notices.Space:
         space = ask(folder)
         return space._replace(free_bytes=space.total_bytes) if folder.stat().st_dev == own_device else space
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(notices, "disk_space", roomy)
+        patch.setattr(notices, "read_disk_space", roomy)
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _forked_programs(runtime_folder: Path) -> Iterator[None]:
     """A program that a test starts begins at once."""
-    forks = None if forked.is_served() else Forks()
+    forks = None if fork_server.is_served() else Forks()
     with pytest.MonkeyPatch.context() as patch:
         for starter in STARTERS:
             patch.setattr(f"{starter}.subprocess", Programs)

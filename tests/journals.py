@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from thermostand.recording.format.journal_lines import journal_lines, lines_of, mark_of
-from thermostand.stand.running.memory.entries import Written, decoded, encoded
+from thermostand.recording.format.journal_lines import format_lines, make_mark, parse_lines
+from thermostand.stand.running.memory.entries import JournalEntry, decode, encode
 
-MARK = mark_of("a session")
+MARK = make_mark("a session")
 
 
-def lines_with(entries: Iterable[Written], place: int = 0, mark: bytes = MARK) -> bytes:
+def lines_with(entries: Iterable[JournalEntry], place: int = 0, mark: bytes = MARK) -> bytes:
     """The lines of a journal, from that place of the file on."""
-    return journal_lines(map(encoded, entries), mark, place)
+    return format_lines(map(encode, entries), mark, place)
 
 
-def read_lines(data: bytes) -> tuple[list[Written], int]:
+def read_lines(data: bytes) -> tuple[list[JournalEntry], int]:
     """The entries of all sound lines, and how many bytes there are up to the end of the last one.
 
     SessionError when a sound line holds an entry that is not known here.
     """
-    lines = lines_of(data)
-    return [decoded(text) for text in lines.sound], lines.size_bytes
+    lines = parse_lines(data)
+    return [decode(text) for text in lines.sound], lines.size_bytes

@@ -4,6 +4,6 @@ import pytest
 from _pytest.mark.structures import ParameterSet
 
 
-def by_night(*values: object) -> ParameterSet:
+def mark_nightly(*values: object) -> ParameterSet:
     """This set of parameters is run by `make nightly` only."""
     return pytest.param(*values, marks=pytest.mark.nightly)

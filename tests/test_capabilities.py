@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.golden.product import commands
-from thermostand.experiments.written import StepEntry
+from thermostand.experiments.recipe_steps import StepEntry
 from thermostand.stand.config.recipe import Experiment
 from thermostand.stand.config.stand_config import StandConfig
 

@@ -8,9 +8,9 @@
 `thermostand.__version__` is the installed version, which pyproject.toml states.
 """
 
-from thermostand.foundation.lazy_names import lazy_names
+from thermostand.foundation.lazy_names import make_lazy_names
 
-_public, __dir__, __all__ = lazy_names(__name__, __file__)
+_public, __dir__, __all__ = make_lazy_names(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:

@@ -11,7 +11,6 @@ from thermostand.compensation import States as States
 from thermostand.compensation import TableSigma as TableSigma
 from thermostand.compensation import ViewCalibration as ViewCalibration
 from thermostand.compensation import Views as Views
-from thermostand.compensation import anchored as anchored
 from thermostand.compensation import calibrate as calibrate
 from thermostand.compensation import calibrate_views as calibrate_views
 from thermostand.compensation import evaluate as evaluate
@@ -22,6 +21,7 @@ from thermostand.compensation import load_model as load_model
 from thermostand.compensation import observations_of as observations_of
 from thermostand.compensation import observe as observe
 from thermostand.compensation import observe_positions as observe_positions
+from thermostand.compensation import rereference as rereference
 from thermostand.compensation import save_model as save_model
 from thermostand.compensation import states as states
 from thermostand.compensation import write_report as write_report

@@ -51,7 +51,7 @@ class Geometry(Document):
     interface_tilt_deg: Annotated[float, Field(ge=0, lt=60)] = 0.0
 
     @model_validator(mode="after")
-    def _possible(self) -> Geometry:
+    def _check_possible(self) -> Geometry:
         if not 0 <= self.interface_mm.value < self.distance_mm.value:
             raise ValueError(
                 f"interface_mm is between the lens and the target, 0 to {self.distance_mm.value:g} mm, "

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
+from thermostand.compensation.calibration.board import Board, compute_camera_shifts, compute_homography_shifts
 from thermostand.compensation.calibration.least_squares import (
     Float,
     Solution,
-    lengths_in_sigmas,
+    compute_normalised_lengths,
+    compute_whiteners,
     minimise,
-    next_discrepancy,
-    whiteners,
+    update_discrepancy,
 )
-from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv, seen_points
+from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv, transform_points
 from thermostand.compensation.calibration.session_centres import Positions, Views
 from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS, TableGeometry, TableSigma
-from thermostand.compensation.drift.hull import convex_hull
+from thermostand.compensation.drift.hull import compute_convex_hull
 from thermostand.foundation.errors import CalibrationError
 
 # The joint adjustment's residuals and their derivatives.
@@ -47,10 +47,11 @@ class Slopes:
     points: Float
 
 
-def equations_of(slopes: Slopes, off: Float, pictures: int, markers: int) -> tuple[Float, Float]:
+def build_normal_equations(slopes: Slopes, off: Float, pictures: int, markers: int) -> tuple[Float, Float]:
     """J' J (n, n) and J' r (n,) of residuals off (M, 2); n = C, then F of each picture, then 3 of each board point."""
     common, own, points, off = (
-        _placed(slopes, part, pictures, markers) for part in (slopes.common, slopes.own, slopes.points, off[..., None])
+        _scatter_blocks(slopes, part, pictures, markers)
+        for part in (slopes.common, slopes.own, slopes.points, off[..., None])
     )
     of_pictures = [part.reshape(pictures, 2 * markers, part.shape[-1]) for part in (common, own, off)]
     of_markers = [
@@ -58,29 +59,32 @@ def equations_of(slopes: Slopes, off: Float, pictures: int, markers: int) -> tup
     ]
     to_own, to_points = np.swapaxes(of_pictures[1], 1, 2), np.swapaxes(of_markers[1], 1, 2)
     flat = common.reshape(-1, common.shape[-1])
-    beside = np.concatenate([_rows(to_own @ of_pictures[0]), _rows(to_points @ of_markers[0])])
+    coupling = np.concatenate([_stack_blocks(to_own @ of_pictures[0]), _stack_blocks(to_points @ of_markers[0])])
     crossed = np.swapaxes(np.swapaxes(own, 2, 3) @ points, 1, 2).reshape(-1, 3 * markers)
-    others = [[_diagonal(to_own @ of_pictures[1]), crossed], [crossed.T, _diagonal(to_points @ of_markers[1])]]
+    others = [
+        [_build_block_diagonal(to_own @ of_pictures[1]), crossed],
+        [crossed.T, _build_block_diagonal(to_points @ of_markers[1])],
+    ]
     # By picture and board point: written out, the derivative is 3,900 x 251 and nearly all zeros, and an adjustment
     # takes 0.27 s instead of 0.11.
-    normal = np.block([[flat.T @ flat, beside.T], [beside, np.block(others)]])
+    normal = np.block([[flat.T @ flat, coupling.T], [coupling, np.block(others)]])
     parts = flat.T @ off.ravel(), (to_own @ of_pictures[2]).ravel(), (to_points @ of_markers[2]).ravel()
     return normal, np.concatenate(parts)
 
 
-def _placed(slopes: Slopes, values: Float, pictures: int, markers: int) -> Float:
+def _scatter_blocks(slopes: Slopes, values: Float, pictures: int, markers: int) -> Float:
     """(pictures, markers, 2, K) of (M, 2, K): 0 where a marker is not used."""
     placed = np.zeros((pictures, markers, *values.shape[1:]))
     placed[slopes.picture, slopes.marker] = values
     return placed
 
 
-def _rows(blocks: Float) -> Float:
+def _stack_blocks(blocks: Float) -> Float:
     """(B K, C) of blocks (B, K, C)."""
     return blocks.reshape(-1, blocks.shape[-1])
 
 
-def _diagonal(blocks: Float) -> Float:
+def _build_block_diagonal(blocks: Float) -> Float:
     """(B K, B K) of blocks (B, K, K)."""
     count, size, _ = blocks.shape
     matrix = np.zeros((count, size, count, size))
@@ -137,33 +141,35 @@ class Problem(ABC, Generic[Sought]):
     lens_sigma: Float
 
     @abstractmethod
-    def seen_points(self, scene: Sought) -> Float:
+    def transform_points(self, scene: Sought) -> Float:
         """(M, 3): the used markers in the camera's frame, mm."""
 
     @abstractmethod
-    def slopes(self, scene: Sought) -> Slopes:
+    def compute_slopes(self, scene: Sought) -> Slopes:
         """Derivatives of the markers' residuals."""
 
     @abstractmethod
-    def stepped(self, scene: Sought, change: Float) -> Sought:
+    def apply_step(self, scene: Sought, change: Float) -> Sought:
         """The scene a step (n,) away."""
 
-    def own_priors(self, scene: Sought) -> tuple[Float, Float]:
+    def compute_own_priors(self, scene: Sought) -> tuple[Float, Float]:
         """Residuals (K,) of what is known beforehand of the pictures' own, and their weights (K,); none."""
         return np.empty(0), np.empty(0)
 
-    def residuals(self, scene: Sought) -> Float:
+    def compute_residuals(self, scene: Sought) -> Float:
         """Markers (x, y each), distortion, the pictures' own, board; all of unit variance."""
-        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(self.seen_points(scene)) - self.centres_px)
+        off = np.einsum("mij,mj->mi", self.whitener, scene.lens.project(self.transform_points(scene)) - self.centres_px)
         board = (scene.points_mm - self.board.points_mm) / self.board.sigma_mm
-        own, _ = self.own_priors(scene)
+        own, _ = self.compute_own_priors(scene)
         return np.concatenate([off.ravel(), scene.lens.distortion / self.lens_sigma, own, board.ravel()])
 
-    def equations(self, scene: Sought, residuals: Float) -> tuple[Float, Float]:
+    def build_equations(self, scene: Sought, residuals: Float) -> tuple[Float, Float]:
         """Normal matrix (n, n) and gradient (n,) of a step of camera, what pictures have of their own, and board."""
         off = residuals[: 2 * len(self.picture)].reshape(-1, 2)
-        normal, gradient = equations_of(self.slopes(scene), off, self.pictures, len(self.board.points_mm))
-        _, own = self.own_priors(scene)
+        normal, gradient = build_normal_equations(
+            self.compute_slopes(scene), off, self.pictures, len(self.board.points_mm)
+        )
+        _, own = self.compute_own_priors(scene)
         weights = np.concatenate([1 / self.lens_sigma, own, 1 / self.board.sigma_mm.ravel()])
         lens, count, others = len(scene.lens.vector), len(normal), len(weights) - len(self.lens_sigma)
         known = np.concatenate([np.arange(lens - len(self.lens_sigma), lens), np.arange(count - others, count)])
@@ -172,7 +178,7 @@ class Problem(ABC, Generic[Sought]):
         return normal, gradient
 
 
-def whitened(
+def build_problem_fields(
     views: Views, board: Board, *, lens: Pinhole, shifts_px: Float, used: NDArray[np.bool_], discrepancy_px: float
 ) -> dict[str, Any]:
     """The fields that all problems have, of the markers `used` (P, N), their ellipses' centres moved by -shifts_px
@@ -183,9 +189,9 @@ def whitened(
         "picture": picture,
         "marker": marker,
         "centres_px": (views.centres_px - shifts_px)[used],
-        "whitener": whiteners(views.covariance_px2[used] + discrepancy_px**2 * np.eye(2)),
+        "whitener": compute_whiteners(views.covariance_px2[used] + discrepancy_px**2 * np.eye(2)),
         "board": board,
-        "lens_sigma": lens_sigma(lens),
+        "lens_sigma": compute_lens_sigma(lens),
     }
 
 
@@ -198,25 +204,27 @@ class TableProblem(Problem[TableScene]):
     freed: NDArray[np.bool_]
     errors_sigma: Float
 
-    def own_priors(self, scene: TableScene) -> tuple[Float, Float]:
+    def compute_own_priors(self, scene: TableScene) -> tuple[Float, Float]:
         """Of the table's free errors."""
         own = (scene.errors / self.errors_sigma)[:, self.freed].ravel()
         return own, np.tile(1 / self.errors_sigma[self.freed], len(scene.errors))
 
-    def seen_points(self, scene: TableScene) -> Float:
+    def transform_points(self, scene: TableScene) -> Float:
         """(M, 3): the used markers in the camera's frame, mm."""
-        rotations, translations = scene.table.poses(self.linear_mm, self.rotary_deg, scene.errors)
+        rotations, translations = scene.table.compute_poses(self.linear_mm, self.rotary_deg, scene.errors)
         turned = np.einsum("mij,mj->mi", rotations[self.picture], scene.points_mm[self.marker])
         return turned + translations[self.picture]
 
-    def slopes(self, scene: TableScene) -> Slopes:
+    def compute_slopes(self, scene: TableScene) -> Slopes:
         """Derivatives of the markers' residuals."""
         points = scene.points_mm[self.marker]
-        seen = self.seen_points(scene)
+        seen = self.transform_points(scene)
         linear, rotary = self.linear_mm[self.picture], self.rotary_deg[self.picture]
-        to_table, to_errors, to_points = scene.table.jacobian(points, linear, rotary, scene.errors[self.picture])
-        by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
-        by_lens = self.whitener @ scene.lens.vector_jacobian(seen)
+        to_table, to_errors, to_points = scene.table.compute_jacobian(
+            points, linear, rotary, scene.errors[self.picture]
+        )
+        by_point = self.whitener @ scene.lens.compute_point_jacobian(seen, self.centres_px)
+        by_lens = self.whitener @ scene.lens.compute_vector_jacobian(seen)
         return Slopes(
             self.picture,
             self.marker,
@@ -225,25 +233,25 @@ class TableProblem(Problem[TableScene]):
             by_point @ to_points,
         )
 
-    def stepped(self, scene: TableScene, change: Float) -> TableScene:
+    def apply_step(self, scene: TableScene, change: Float) -> TableScene:
         """The scene a step (n,) of camera, table, free table errors and board points away."""
         lens, free = len(scene.lens.vector), int(self.freed.sum())
         first_point = len(change) - scene.points_mm.size
         errors = scene.errors.copy()
         errors[:, self.freed] += change[lens + PARAMETERS : first_point].reshape(-1, free)
         return TableScene(
-            scene.lens.stepped(change[:lens]),
-            scene.table.stepped(change[lens : lens + PARAMETERS]),
+            scene.lens.apply_step(change[:lens]),
+            scene.table.apply_step(change[lens : lens + PARAMETERS]),
             errors,
             scene.points_mm + change[first_point:].reshape(-1, 3),
         )
 
 
-def table_problem(positions: Positions, board: Board, sigma: TableSigma, **chosen: Any) -> TableProblem:
+def build_table_problem(positions: Positions, board: Board, sigma: TableSigma, **chosen: Any) -> TableProblem:
     """chosen: as `whitened` takes it."""
     freed = sigma.vector > 0
     return TableProblem(
-        **whitened(positions, board, **chosen),
+        **build_problem_fields(positions, board, **chosen),
         linear_mm=positions.linear_mm,
         rotary_deg=positions.rotary_deg,
         freed=freed,
@@ -251,7 +259,7 @@ def table_problem(positions: Positions, board: Board, sigma: TableSigma, **chose
     )
 
 
-def lens_sigma(lens: Pinhole) -> Float:
+def compute_lens_sigma(lens: Pinhole) -> Float:
     """Weak priors of the distortion: each term moves the image's corner by a part of its radius.
 
     They bound only combinations that the markers do not see, such as k1 against k4.
@@ -266,7 +274,7 @@ _LEAST_TURN_DEG = 5.0
 _LEAST_TRAVEL_MM = 10.0
 
 
-def table_from_poses(
+def fit_table(
     linear_mm: Float, rotary_deg: Float, rotations: Float, translations_mm: Float, middle_mm: Float
 ) -> TableGeometry:
     """The table that puts the target, whose middle is (3,), at poses (P, 3, 3) and (P, 3).
@@ -278,22 +286,22 @@ def table_from_poses(
             f"the positions span {np.ptp(linear_mm):g} mm and {np.ptp(rotary_deg):g} deg; "
             f"{_LEAST_TRAVEL_MM:g} mm and {_LEAST_TURN_DEG:g} deg are needed to separate camera and table"
         )
-    rotary = _axis(rotary_deg, rotations)
+    rotary = _find_rotary_axis(rotary_deg, rotations)
     turns = Rotation.from_rotvec(rotary_deg[:, None] * rotary, degrees=True)
     mount = (turns.inv() * Rotation.from_matrix(rotations)).mean().as_matrix()
-    base_mm, linear, offset_mm = _places(linear_mm, turns.as_matrix(), translations_mm)
+    base_mm, linear, offset_mm = _fit_offsets(linear_mm, turns.as_matrix(), translations_mm)
     # What of o is along the axis is for the wobble to act on, and otherwise the same as a shift of the base.
     along = rotary * (rotary @ (offset_mm + mount @ middle_mm))
     return TableGeometry(base_mm + along, linear, rotary, mount, offset_mm - along)
 
 
-def _axis(rotary_deg: Float, rotations: Float) -> Float:
+def _find_rotary_axis(rotary_deg: Float, rotations: Float) -> Float:
     """Unit vector about which the target turns with rising angle: sum of all turns from the first position."""
     total = (rotary_deg - rotary_deg[0]) @ Rotation.from_matrix(rotations @ rotations[0].T).as_rotvec()
     return total / np.linalg.norm(total)
 
 
-def _places(linear_mm: Float, turns: Float, translations_mm: Float) -> tuple[Float, Float, Float]:
+def _fit_offsets(linear_mm: Float, turns: Float, translations_mm: Float) -> tuple[Float, Float, Float]:
     """c, l and o of t = c + z l + turn o, by least squares."""
     identity = np.broadcast_to(np.eye(3), turns.shape)
     design = np.concatenate([identity, linear_mm[:, None, None] * np.eye(3), turns], axis=2).reshape(-1, 9)
@@ -360,7 +368,7 @@ class Adjustment:
     @property
     def hull_px(self) -> Float:
         """(H, 2): of the markers that were used, where they were seen."""
-        return convex_hull(self.positions.centres_px[self.used])
+        return compute_convex_hull(self.positions.centres_px[self.used])
 
     @property
     def normalised(self) -> Float:
@@ -372,13 +380,13 @@ class Adjustment:
         """Root mean square residual per coordinate over the detection sigma."""
         return float(np.sqrt(np.mean(self.normalised[self.used] ** 2)))
 
-    def poses(self) -> tuple[Float, Float]:
+    def compute_poses(self) -> tuple[Float, Float]:
         """Rotation (P, 3, 3) and translation (P, 3), mm, of the target at each position."""
-        return self.scene.table.poses(self.positions.linear_mm, self.positions.rotary_deg, self.scene.errors)
+        return self.scene.table.compute_poses(self.positions.linear_mm, self.positions.rotary_deg, self.scene.errors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Round:
+class _Iteration:
     """One adjustment with fixed eccentricities, markers and discrepancy. excess: squares over their
     expectation, 1 when all is explained."""
 
@@ -394,7 +402,7 @@ class _Round:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class InitialGuess:
     """Where an adjustment begins: Brown's camera and the table, with the corrections (P, N, 2), px, by homographies."""
 
     scene: TableScene
@@ -402,27 +410,27 @@ class Start:
 
 
 def adjust(
-    positions: Positions, board: Board, sigma: TableSigma, *, rational: bool = False, start: Start | None = None
+    positions: Positions, board: Board, sigma: TableSigma, *, rational: bool = False, start: InitialGuess | None = None
 ) -> Adjustment:
     """Calibrate: OpenCV and the target's poses give the start, then everything is adjusted together.
 
     start: of these positions, where it is known already. Rounds follow until the eccentricity of the discs, the
     outliers and the discrepancy are settled. CalibrationError when the observations do not determine a camera.
     """
-    start = start or start_of(positions, board)
+    start = start or find_initial_guess(positions, board)
     scene, shifts = start.scene, start.shifts_px
     if rational:
         scene = replace(scene, lens=Pinhole(np.concatenate([scene.lens.vector, np.zeros(3)]), scene.lens.image_size))
     given = positions, board, sigma
-    found = _adjusted(*given, start=scene, shifts_px=shifts, used=positions.seen, discrepancy_px=0.0)
+    found = _adjust_once(*given, start=scene, shifts_px=shifts, used=positions.seen, discrepancy_px=0.0)
     for _ in range(_ROUNDS):
         scene = found.solution.state
-        poses = scene.table.poses(positions.linear_mm, positions.rotary_deg, scene.errors)
-        shifts = shifts_by_camera(scene.lens.project, *poses, scene.points_mm, board.diameters_mm)
+        poses = scene.table.compute_poses(positions.linear_mm, positions.rotary_deg, scene.errors)
+        shifts = compute_camera_shifts(scene.lens.project, *poses, scene.points_mm, board.diameters_mm)
         discrepancy_px = found.discrepancy_px
         if not found.is_explained:
-            discrepancy_px = next_discrepancy(positions.sigma_px**2, discrepancy_px, found.excess)
-        found = _adjusted(*given, start=scene, shifts_px=shifts, used=found.inliers, discrepancy_px=discrepancy_px)
+            discrepancy_px = update_discrepancy(positions.sigma_px**2, discrepancy_px, found.excess)
+        found = _adjust_once(*given, start=scene, shifts_px=shifts, used=found.inliers, discrepancy_px=discrepancy_px)
         if found.is_explained and np.array_equal(found.used, found.inliers):
             break
     return Adjustment(
@@ -439,7 +447,7 @@ def adjust(
     )
 
 
-def _adjusted(
+def _adjust_once(
     positions: Positions,
     board: Board,
     sigma: TableSigma,
@@ -448,29 +456,29 @@ def _adjusted(
     shifts_px: Float,
     used: NDArray[np.bool_],
     discrepancy_px: float,
-) -> _Round:
+) -> _Iteration:
     chosen = {"shifts_px": shifts_px, "used": used, "discrepancy_px": discrepancy_px}
-    problem = table_problem(positions, board, sigma, lens=start.lens, **chosen)
-    solution = minimise(start, problem.residuals, problem.equations, problem.stepped)
-    degrees = len(problem.residuals(solution.state)) - len(solution.covariance)
+    problem = build_table_problem(positions, board, sigma, lens=start.lens, **chosen)
+    solution = minimise(start, problem.compute_residuals, problem.build_equations, problem.apply_step)
+    degrees = len(problem.compute_residuals(solution.state)) - len(solution.covariance)
     chi2 = solution.cost / degrees
-    excess = max(chi2, _board_excess(solution, board))
-    residuals = _residuals(solution.state, positions, shifts_px)
+    excess = max(chi2, _compute_board_excess(solution, board))
+    residuals = _compute_residuals(solution.state, positions, shifts_px)
     slack = 3 * np.sqrt(2 / degrees) if discrepancy_px == 0 else _CLOSE_TO_ONE
-    return _Round(
+    return _Iteration(
         solution=solution,
         shifts_px=shifts_px,
         used=used,
         discrepancy_px=discrepancy_px,
         residuals_px=residuals,
-        inliers=_inliers(residuals, positions, discrepancy_px),
+        inliers=_find_inliers(residuals, positions, discrepancy_px),
         chi2=chi2,
         excess=excess,
         is_explained=bool(excess <= 1 + slack and (discrepancy_px == 0 or excess >= 1 - slack)),
     )
 
 
-def _board_excess(solution: Solution[TableScene], board: Board) -> float:
+def _compute_board_excess(solution: Solution[TableScene], board: Board) -> float:
     """Squared corrections of the board in its plane over what its prior allows, less three standard errors.
 
     A lens that the model cannot follow bends the board before it shows in the residuals.
@@ -481,30 +489,30 @@ def _board_excess(solution: Solution[TableScene], board: Board) -> float:
     return float(np.sum(moved[:, :2] ** 2)) / free - 3 * np.sqrt(2 / free)
 
 
-def start_of(positions: Positions, board: Board) -> Start:
+def find_initial_guess(positions: Positions, board: Board) -> InitialGuess:
     """Camera and poses by OpenCV, of centres corrected by the homographies."""
     shifts = np.array(
-        [shifts_by_homography(centres, board.points_mm, board.diameters_mm) for centres in positions.centres_px]
+        [compute_homography_shifts(centres, board.points_mm, board.diameters_mm) for centres in positions.centres_px]
     )
     centres = positions.centres_px - shifts
     start = calibrate_opencv(centres, board.points_mm, positions.image_size)
-    table = table_from_poses(
+    table = fit_table(
         positions.linear_mm, positions.rotary_deg, start.rotations, start.translations_mm, board.points_mm.mean(axis=0)
     )
-    return Start(TableScene(start.lens, table, np.zeros((len(centres), ERRORS)), board.points_mm), shifts)
+    return InitialGuess(TableScene(start.lens, table, np.zeros((len(centres), ERRORS)), board.points_mm), shifts)
 
 
-def _residuals(scene: TableScene, positions: Positions, shifts_px: Float) -> Float:
+def _compute_residuals(scene: TableScene, positions: Positions, shifts_px: Float) -> Float:
     """(P, N, 2): computed minus measured centres, px; NaN without a centre."""
-    rotations, translations = scene.table.poses(positions.linear_mm, positions.rotary_deg, scene.errors)
-    seen = seen_points(rotations, translations, scene.points_mm)
+    rotations, translations = scene.table.compute_poses(positions.linear_mm, positions.rotary_deg, scene.errors)
+    seen = transform_points(rotations, translations, scene.points_mm)
     return scene.lens.project(seen) - (positions.centres_px - shifts_px)
 
 
-def _inliers(residuals_px: Float, positions: Positions, discrepancy_px: float) -> NDArray[np.bool_]:
+def _find_inliers(residuals_px: Float, positions: Positions, discrepancy_px: float) -> NDArray[np.bool_]:
     """(P, N): markers not far outside the scatter of all, unless those that are would be too many for accidents."""
     seen = positions.seen
-    lengths = lengths_in_sigmas(residuals_px[seen], positions.covariance_px2[seen], discrepancy_px)
+    lengths = compute_normalised_lengths(residuals_px[seen], positions.covariance_px2[seen], discrepancy_px)
     near = lengths <= max(_LEAST_OUTLIER_SIGMA, _OUTLIER * float(np.median(lengths)) / _MEDIAN_LENGTH)
     inliers = seen.copy()
     if np.mean(~near) <= _MOST_OUTLIERS:

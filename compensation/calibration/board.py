@@ -9,7 +9,7 @@ import numpy as np
 
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.markers.corner_board import BoardOfCorners
-from thermostand.markers.eccentricity import centroid_offsets_px, disc_centres_by_homography_px
+from thermostand.markers.eccentricity import compute_centroid_offsets_px, compute_disc_centres_by_homography_px
 from thermostand.markers.target import Target
 
 _POINT_mm = 1e-3
@@ -25,14 +25,14 @@ class Board:
     diameters_mm: Float
 
 
-def board_of_corners(board: BoardOfCorners) -> Board:
+def make_corner_board(board: BoardOfCorners) -> Board:
     """The board of a file of corners, as dots so small that their outlines have no other centres than they have."""
     sigma = np.tile([board.printing_error_mm, board.printing_error_mm, board.flatness_mm], (board.count, 1))
     points = np.column_stack([board.coordinates_mm(), np.zeros(board.count)])
     return Board(points, sigma, np.full(board.count, _POINT_mm))
 
 
-def board_of(target: Target) -> Board:
+def make_board(target: Target) -> Board:
     """The target file's board: measured centres with their uncertainty, or nominal ones with the printing error."""
     plane = target.coordinates_mm()
     in_plane_mm = target.printing_error_mm if target.cmm_mm is None else target.cmm_uncertainty_mm
@@ -55,12 +55,12 @@ _OUTLINE_RADIUS = float(np.sqrt(3 / (2 + np.cos(2 * np.pi / _OUTLINE_POINTS))))
 """Of the polygon over the disc's: both then have the same second moment over area, which is what moves the centroid."""
 
 
-def shifts_by_homography(centres_px: Float, points_mm: Float, diameters_mm: Float) -> Float:
+def compute_homography_shifts(centres_px: Float, points_mm: Float, diameters_mm: Float) -> Float:
     """Centre of the ellipse minus image of the centre (N, 2), px; NaN where the marker has no centre."""
-    return centres_px - disc_centres_by_homography_px(centres_px, points_mm[:, :2], diameters_mm / 2)
+    return centres_px - compute_disc_centres_by_homography_px(centres_px, points_mm[:, :2], diameters_mm / 2)
 
 
-def shifts_by_camera(
+def compute_camera_shifts(
     projection: Project, rotation: Float, translation_mm: Float, points_mm: Float, diameters_mm: Float
 ) -> Float:
     """Centroid of the disc's image minus image of the centre (..., N, 2), px, for poses (..., 3, 3) and (..., 3)."""
@@ -70,4 +70,4 @@ def shifts_by_camera(
     target_mm = np.concatenate([outline_mm, points_mm[:, None]], axis=1)
     seen_mm = np.einsum("...ij,nkj->...nki", rotation, target_mm) + translation_mm[..., None, None, :]
     pixels = projection(seen_mm)
-    return centroid_offsets_px(pixels[..., :-1, :], pixels[..., -1, :])
+    return compute_centroid_offsets_px(pixels[..., :-1, :], pixels[..., -1, :])

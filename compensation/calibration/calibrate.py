@@ -10,10 +10,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.calibration.adjustment import Adjustment, adjust, start_of
-from thermostand.compensation.calibration.board import Board, board_of
+from thermostand.compensation.calibration.adjustment import Adjustment, adjust, find_initial_guess
+from thermostand.compensation.calibration.board import Board, make_board
 from thermostand.compensation.calibration.least_squares import Float
-from thermostand.compensation.calibration.pinhole import seen_points
+from thermostand.compensation.calibration.pinhole import transform_points
 from thermostand.compensation.calibration.pose import Lens, find_pose
 from thermostand.compensation.calibration.rays import DEGREES, RayLens, fit_rays
 from thermostand.compensation.calibration.session_centres import Positions
@@ -21,8 +21,8 @@ from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.calibration.uncertainty import (
     CameraDifference,
     UncertaintyMap,
-    difference,
-    projection_uncertainty,
+    compare_calibrations,
+    compute_projection_uncertainty,
 )
 from thermostand.foundation.errors import CalibrationError
 from thermostand.markers.target import Target
@@ -48,7 +48,7 @@ class ModelScore:
 Check = TypeVar("Check")
 
 
-def known_or_why(check: Callable[[], Check]) -> tuple[Check | None, str]:
+def try_check(check: Callable[[], Check]) -> tuple[Check | None, str]:
     """What a check of a result gives, or None and why it cannot be made: the result stands without it."""
     try:
         return check(), ""
@@ -56,26 +56,26 @@ def known_or_why(check: Callable[[], Check]) -> tuple[Check | None, str]:
         return None, str(error)
 
 
-def rays_of(adjustment: Adjustment, degree: int) -> RayLens:
+def fit_ray_lens(adjustment: Adjustment, degree: int) -> RayLens:
     """The ray model of a degree through the adjusted markers."""
-    return fit_rays(degree, *_used(adjustment), adjustment.scene.lens, adjustment.hull_px)
+    return fit_rays(degree, *_collect_used_markers(adjustment), adjustment.scene.lens, adjustment.hull_px)
 
 
-def times_the_pinhole(adjustment: Adjustment, rays: RayLens, scores: tuple[ModelScore, ...]) -> float:
+def compute_rms_ratio(adjustment: Adjustment, rays: RayLens, scores: tuple[ModelScore, ...]) -> float:
     """What the rays leave over what the pinhole leaves: RMS at held-out positions, and without these residuals in
     units of the noise and of what the pinhole does not explain."""
     of = {score.model: score.rms_px for score in scores}
     if scores:
-        return of[ray_name(rays.degree)] / min(of[BROWN], of[RATIONAL])
-    pixels, points_mm, sigma_px = _used(adjustment)
-    return float(np.sqrt(np.mean((rays.misfit(points_mm, pixels) / sigma_px[:, None]) ** 2)))
+        return of[format_ray_name(rays.degree)] / min(of[BROWN], of[RATIONAL])
+    pixels, points_mm, sigma_px = _collect_used_markers(adjustment)
+    return float(np.sqrt(np.mean((rays.compute_misfit(points_mm, pixels) / sigma_px[:, None]) ** 2)))
 
 
-def _used(adjustment: Adjustment) -> tuple[Float, Float, Float]:
+def _collect_used_markers(adjustment: Adjustment) -> tuple[Float, Float, Float]:
     """Pixels (M, 2), points (M, 3), mm, of the camera's frame, and sigma (M,), px, of the markers that were used."""
     used, positions = adjustment.used, adjustment.positions
-    rotations, translations = adjustment.poses()
-    points = seen_points(rotations, translations, adjustment.scene.points_mm)
+    rotations, translations = adjustment.compute_poses()
+    points = transform_points(rotations, translations, adjustment.scene.points_mm)
     variance = np.trace(positions.covariance_px2[used], axis1=1, axis2=2) / 2 + adjustment.discrepancy_px**2
     return positions.centres_px[used], points[used], np.sqrt(variance)
 
@@ -85,37 +85,37 @@ def score_models(positions: Positions, board: Board, sigma: TableSigma) -> tuple
     fold = np.arange(len(positions.linear_mm)) % _FOLDS
     squares: dict[str, list[float]] = {}
     for number in range(_FOLDS):
-        kept, held = positions.part(fold != number), positions.part(fold == number)
-        for name, lens, adjusted in _models(kept, board, sigma):
-            squares.setdefault(name, []).extend(_held_out_squares(lens, adjusted, held))
-    return tuple(_score(name, np.array(values)) for name, values in squares.items())
+        kept, held = positions.select(fold != number), positions.select(fold == number)
+        for name, lens, adjusted in _fit_models(kept, board, sigma):
+            squares.setdefault(name, []).extend(_score_held_out(lens, adjusted, held))
+    return tuple(_summarise_squares(name, np.array(values)) for name, values in squares.items())
 
 
-def best(scores: tuple[ModelScore, ...]) -> str:
+def select_model(scores: tuple[ModelScore, ...]) -> str:
     """The simplest model (they come in order) whose score is within one standard error of the best."""
     lowest = min(scores, key=lambda score: score.rms_px)
     return next(score.model for score in scores if score.rms_px <= lowest.rms_px + lowest.sigma_px)
 
 
-def halves(
+def compare_halves(
     positions: Positions, board: Board, sigma: TableSigma, distance_mm: float, *, rational: bool
 ) -> CameraDifference:
     """What the calibrations from every other position and from the rest say differently."""
     odd = np.arange(len(positions.linear_mm)) % 2 == 1
-    first, second = (adjust(positions.part(chosen), board, sigma, rational=rational) for chosen in (~odd, odd))
-    return difference(first, second, distance_mm)
+    first, second = (adjust(positions.select(chosen), board, sigma, rational=rational) for chosen in (~odd, odd))
+    return compare_calibrations(first, second, distance_mm)
 
 
-def ray_name(degree: int) -> str:
+def format_ray_name(degree: int) -> str:
     """What the ray model of a degree is called in a score."""
     return f"rays, degree {degree}"
 
 
-def _models(positions: Positions, board: Board, sigma: TableSigma) -> list[tuple[str, Lens, Board]]:
-    start = start_of(positions, board)
+def _fit_models(positions: Positions, board: Board, sigma: TableSigma) -> list[tuple[str, Lens, Board]]:
+    start = find_initial_guess(positions, board)
     brown = adjust(positions, board, sigma, start=start)
     rational = adjust(positions, board, sigma, rational=True, start=start)
-    rays = [(ray_name(degree), rays_of(brown, degree), brown.adjusted_board) for degree in DEGREES]
+    rays = [(format_ray_name(degree), fit_ray_lens(brown, degree), brown.adjusted_board) for degree in DEGREES]
     return [
         (BROWN, brown.scene.lens, brown.adjusted_board),
         (RATIONAL, rational.scene.lens, rational.adjusted_board),
@@ -123,11 +123,11 @@ def _models(positions: Positions, board: Board, sigma: TableSigma) -> list[tuple
     ]
 
 
-def _held_out_squares(lens: Lens, board: Board, held: Positions) -> list[float]:
+def _score_held_out(lens: Lens, board: Board, held: Positions) -> list[float]:
     """Mean square residual per coordinate, px^2, of each held-out position with enough markers."""
     found: list[float] = []
     for centres, covariance in zip(held.centres_px, held.covariance_px2, strict=True):
-        inside = _inside(lens, centres)
+        inside = _find_usable_markers(lens, centres)
         if np.count_nonzero(inside) < 12:
             continue
         kept = np.where(inside[:, None], centres, np.nan)
@@ -140,7 +140,7 @@ def _held_out_squares(lens: Lens, board: Board, held: Positions) -> list[float]:
     return found
 
 
-def _inside(lens: Lens, centres_px: Float) -> NDArray[np.bool_]:
+def _find_usable_markers(lens: Lens, centres_px: Float) -> NDArray[np.bool_]:
     """Markers that are seen, and for the ray model within its hull: it must not be extrapolated."""
     seen = np.isfinite(centres_px[:, 0])
     if isinstance(lens, RayLens):
@@ -148,7 +148,7 @@ def _inside(lens: Lens, centres_px: Float) -> NDArray[np.bool_]:
     return seen
 
 
-def _score(model: str, squares: Float) -> ModelScore:
+def _summarise_squares(model: str, squares: Float) -> ModelScore:
     rms = float(np.sqrt(squares.mean()))
     return ModelScore(model, rms, float(squares.std() / np.sqrt(len(squares)) / (2 * rms)), len(squares))
 
@@ -207,24 +207,30 @@ def calibrate(
     Without scores the pinhole is Brown's unless `model` says otherwise, and the rays are of the lowest degree.
     sigma: of the table, else a TableSigma as it is. CalibrationError when the positions do not determine a camera.
     """
-    board, sigma = board_of(target), sigma or TableSigma()
-    known, no_scores = known_or_why(lambda: score_models(positions, board, sigma))
+    board, sigma = make_board(target), sigma or TableSigma()
+    known, no_scores = try_check(lambda: score_models(positions, board, sigma))
     scores = known or ()
     pinholes = tuple(score for score in scores if score.model in (BROWN, RATIONAL))
-    chosen = {Model.BROWN: BROWN, Model.RATIONAL: RATIONAL}.get(model) or (best(pinholes) if scores else BROWN)
+    chosen = {Model.BROWN: BROWN, Model.RATIONAL: RATIONAL}.get(model) or (select_model(pinholes) if scores else BROWN)
     adjustment = adjust(positions, board, sigma, rational=chosen == RATIONAL)
-    name = best(tuple(score for score in scores if score not in pinholes)) if scores else ray_name(min(DEGREES))
-    rays = rays_of(adjustment, next(degree for degree in DEGREES if ray_name(degree) == name))
-    distance_mm = float(np.mean(adjustment.poses()[1][:, 2]))
-    apart, no_halves = known_or_why(lambda: halves(positions, board, sigma, distance_mm, rational=chosen == RATIONAL))
+    name = (
+        select_model(tuple(score for score in scores if score not in pinholes))
+        if scores
+        else format_ray_name(min(DEGREES))
+    )
+    rays = fit_ray_lens(adjustment, next(degree for degree in DEGREES if format_ray_name(degree) == name))
+    distance_mm = float(np.mean(adjustment.compute_poses()[1][:, 2]))
+    apart, no_halves = try_check(
+        lambda: compare_halves(positions, board, sigma, distance_mm, rational=chosen == RATIONAL)
+    )
     checks = {"how well held-out positions are met": no_scores, "by how much the halves differ": no_halves}
     return CameraCalibration(
         adjustment=adjustment,
         rays=rays,
         scores=scores,
         model=chosen,
-        uncertainty=projection_uncertainty(adjustment, distance_mm),
+        uncertainty=compute_projection_uncertainty(adjustment, distance_mm),
         halves=apart,
         not_known=tuple(f"{what} is not known: {why}" for what, why in checks.items() if why),
-        rays_times=times_the_pinhole(adjustment, rays, scores),
+        rays_times=compute_rms_ratio(adjustment, rays, scores),
     )

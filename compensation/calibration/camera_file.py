@@ -17,24 +17,24 @@ from thermostand.compensation.calibration.board import Board
 from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.pinhole import NAMES, Pinhole
-from thermostand.compensation.calibration.rays import RayLens, exponents
+from thermostand.compensation.calibration.rays import RayLens, list_exponents
 from thermostand.compensation.calibration.stage_geometry import ERRORS, PARAMETERS
 from thermostand.compensation.calibration.uncertainty import NOT_SEEN
 from thermostand.compensation.drift.hull import is_area
-from thermostand.compensation.sound_values import (
+from thermostand.compensation.value_checks import (
     Hull,
     Length,
     NotNegative,
     Pair,
     Size,
     check_covariance,
+    check_shape,
     check_within_image,
-    shaped,
 )
 from thermostand.foundation.documents import Document, load_json
 from thermostand.foundation.errors import CalibrationError
-from thermostand.foundation.files import write_whole
-from thermostand.foundation.json_values import plain
+from thermostand.foundation.files import write_atomically
+from thermostand.foundation.json_values import make_plain
 
 FORMAT = "thermostand camera"
 
@@ -77,10 +77,10 @@ class TablePart(Document):
     rms_px: tuple[NotNegative | None, ...]
 
     @model_validator(mode="after")
-    def _fits_together(self) -> TablePart:
+    def _check_consistent(self) -> TablePart:
         positions = len(self.linear_mm)
-        shaped("rotary_deg", self.rotary_deg, (positions,))
-        shaped("errors_mm_rad", self.errors_mm_rad, (positions, ERRORS))
+        check_shape("rotary_deg", self.rotary_deg, (positions,))
+        check_shape("errors_mm_rad", self.errors_mm_rad, (positions, ERRORS))
         if len(self.rms_px) != positions:
             raise ValueError(f"rms_px: {len(self.rms_px)} for {positions} positions")
         mount = np.array(self.mount)
@@ -110,12 +110,12 @@ class RaysPart(Document):
     hull_px: Hull
 
     @model_validator(mode="after")
-    def _fits_together(self) -> RaysPart:
-        count = len(exponents(self.degree))
-        if list(self.terms_pq) != exponents(self.degree):
+    def _check_consistent(self) -> RaysPart:
+        count = len(list_exponents(self.degree))
+        if list(self.terms_pq) != list_exponents(self.degree):
             raise ValueError(f"terms_pq: not the {count} terms of degree {self.degree}, in order")
-        shaped("coefficients_mm", self.coefficients_mm, (2, 2, count))
-        shaped("covariance_mm2", self.covariance_mm2, (2 * count, 2 * count))
+        check_shape("coefficients_mm", self.coefficients_mm, (2, 2, count))
+        check_shape("covariance_mm2", self.covariance_mm2, (2 * count, 2 * count))
         return self
 
 
@@ -141,8 +141,8 @@ class UncertaintyPart(Document):
     not_seen: str = ""
 
     @model_validator(mode="after")
-    def _fits_together(self) -> UncertaintyPart:
-        shaped("sigma_px", self.sigma_px, (len(self.y_px), len(self.x_px)))
+    def _check_consistent(self) -> UncertaintyPart:
+        check_shape("sigma_px", self.sigma_px, (len(self.y_px), len(self.x_px)))
         return self
 
 
@@ -172,11 +172,11 @@ class CameraFile(Document):
     rays_doubt: str = ""
 
     @model_validator(mode="after")
-    def _fits_together(self) -> CameraFile:
+    def _check_consistent(self) -> CameraFile:
         if len(self.vector) not in (9, 12) or self.names != NAMES[: len(self.vector)]:
             raise ValueError("names: not those of a pinhole with 5 or 8 distortion terms")
         known = len(self.vector) + PARAMETERS
-        shaped("covariance", self.covariance, (known, known))
+        check_shape("covariance", self.covariance, (known, known))
         if not len(self.board.points_mm) == len(self.board.sigma_mm) == len(self.board.diameters_mm):
             raise ValueError("board: points_mm, sigma_mm and diameters_mm have different lengths")
         return self
@@ -192,15 +192,15 @@ class CameraFile(Document):
         if max(abs(cx), abs(cy)) > _FARTHEST_CENTRE * side:
             raise ValueError(f"vector: the centre is at {cx:.3g}, {cy:.3g} px of an image of {side} px")
         middle = (np.array(self.image_size_px) - 1.0) / 2
-        self._slopes(middle if self.rays is None else np.array(self.rays.hull_px))
+        self._compute_slopes(middle if self.rays is None else np.array(self.rays.hull_px))
         if self.rays is not None:
             self._check_rays(self.rays)
         return self
 
-    def _slopes(self, pixels: Float) -> Float:
+    def _compute_slopes(self, pixels: Float) -> Float:
         """(..., 2), of the pinhole."""
         with np.errstate(all="ignore"):  # of numbers that are refused here
-            slopes = self.lens.slopes(pixels)
+            slopes = self.lens.compute_slopes(pixels)
         if not np.isfinite(slopes).all():
             raise ValueError("vector: this distortion folds the image where the markers were seen")
         return slopes
@@ -213,7 +213,9 @@ class CameraFile(Document):
         if not is_area(hull_px):
             raise ValueError("rays.hull_px: not the corners of a convex area, in order")
         with np.errstate(all="ignore"):
-            apart_px = np.abs(self.ray_lens.slopes(hull_px) - self._slopes(hull_px)) * self.lens.focal_px
+            apart_px = (
+                np.abs(self.ray_lens.compute_slopes(hull_px) - self._compute_slopes(hull_px)) * self.lens.focal_px
+            )
         check_within_image("rays.coefficients_mm", apart_px, self.image_size_px)
 
     @property
@@ -237,7 +239,7 @@ class CameraFile(Document):
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all; SessionError when the place refuses."""
-        write_whole(path, self.model_dump_json(indent=1) + "\n")
+        write_atomically(path, self.model_dump_json(indent=1) + "\n")
 
 
 def load_camera(path: Path | str) -> CameraFile:
@@ -247,7 +249,7 @@ def load_camera(path: Path | str) -> CameraFile:
     )
 
 
-def camera_file(
+def build_camera_file(
     calibration: CameraCalibration,
     *,
     camera_serial: str,
@@ -270,19 +272,19 @@ def camera_file(
         "names": NAMES[: len(lens.vector)],
         "vector": lens.vector,
         "covariance": calibration.adjustment.covariance[:known, :known],
-        "fit": _fit(calibration),
-        "table": _table(calibration.adjustment),
+        "fit": _describe_fit(calibration),
+        "table": _describe_table(calibration.adjustment),
         "board": calibration.adjustment.adjusted_board,
-        "rays": None if calibration.rays_doubt and not keep_rays else _rays(calibration.rays),
+        "rays": None if calibration.rays_doubt and not keep_rays else _describe_rays(calibration.rays),
         "rays_doubt": calibration.rays_doubt,
         "scores": calibration.scores,
-        "uncertainty": _uncertainty(calibration),
+        "uncertainty": _describe_uncertainty(calibration),
         "not_known": calibration.not_known,
     }
-    return CameraFile.model_validate(plain(document))
+    return CameraFile.model_validate(make_plain(document))
 
 
-def _fit(calibration: CameraCalibration) -> dict[str, object]:
+def _describe_fit(calibration: CameraCalibration) -> dict[str, object]:
     adjustment = calibration.adjustment
     return {
         "rms_px": adjustment.rms_px,
@@ -296,9 +298,9 @@ def _fit(calibration: CameraCalibration) -> dict[str, object]:
     }
 
 
-def _table(adjustment: Adjustment) -> dict[str, object]:
+def _describe_table(adjustment: Adjustment) -> dict[str, object]:
     positions, squares = adjustment.positions, np.where(adjustment.used[:, :, None], adjustment.residuals_px**2, np.nan)
-    return plain(adjustment.scene.table) | {
+    return make_plain(adjustment.scene.table) | {
         "linear_mm": positions.linear_mm,
         "rotary_deg": positions.rotary_deg,
         "errors_mm_rad": adjustment.scene.errors,
@@ -306,10 +308,10 @@ def _table(adjustment: Adjustment) -> dict[str, object]:
     }
 
 
-def _rays(rays: RayLens) -> dict[str, object]:
+def _describe_rays(rays: RayLens) -> dict[str, object]:
     return {
         "degree": rays.degree,
-        "terms_pq": exponents(rays.degree),
+        "terms_pq": list_exponents(rays.degree),
         "coefficients_mm": rays.coefficients,
         "covariance_mm2": rays.covariance,
         "range_mm": rays.range_mm,
@@ -317,7 +319,7 @@ def _rays(rays: RayLens) -> dict[str, object]:
     }
 
 
-def _uncertainty(calibration: CameraCalibration) -> dict[str, object]:
+def _describe_uncertainty(calibration: CameraCalibration) -> dict[str, object]:
     found = calibration.uncertainty
     return {
         "distance_mm": found.distance_mm,

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import yaml
 
-from thermostand.compensation.calibration.least_squares import Float, dense, minimise
+from thermostand.compensation.calibration.least_squares import Float, make_equations, minimise
 from thermostand.compensation.calibration.pinhole import Pinhole
-from thermostand.compensation.calibration.uncertainty import grid_pixels
-from thermostand.foundation.files import make_folder, write_whole
+from thermostand.compensation.calibration.uncertainty import make_pixel_grid
+from thermostand.foundation.files import make_folder, write_atomically
 
 _GRID_COLUMNS = 33  # round number; nothing was measured
 
@@ -36,26 +36,26 @@ def refit_radtan(lens: Pinhole) -> RadtanFit:
 
     A rational denominator and k3 go into k1, k2 and the focal lengths, not away.
     """
-    pixels = grid_pixels(lens.image_size, _GRID_COLUMNS).reshape(-1, 2)
-    slopes = lens.slopes(pixels)
+    pixels = make_pixel_grid(lens.image_size, _GRID_COLUMNS).reshape(-1, 2)
+    slopes = lens.compute_slopes(pixels)
     kept = np.isfinite(slopes).all(axis=1)
     points = np.column_stack([slopes[kept], np.ones(np.count_nonzero(kept))])
     vector = np.concatenate([lens.vector[:8], [0.0]])
 
     def step(state: Pinhole, change: Float) -> Pinhole:
-        return state.stepped(np.concatenate([change, [0.0]]))
+        return state.apply_step(np.concatenate([change, [0.0]]))
 
     solution = minimise(
         Pinhole(vector, lens.image_size),
         lambda state: (state.project(points) - pixels[kept]).ravel() / 1e-6,
-        dense(lambda state: state.vector_jacobian(points)[:, :, :8].reshape(-1, 8) / 1e-6),
+        make_equations(lambda state: state.compute_vector_jacobian(points)[:, :, :8].reshape(-1, 8) / 1e-6),
         step,
     )
     off = solution.state.project(points) - pixels[kept]
     return RadtanFit(solution.state, float(np.sqrt(np.mean(off**2))), float(np.linalg.norm(off, axis=1).max()))
 
 
-def opencv_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
+def format_opencv_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
     """OpenCV's FileStorage. rms_px: per coordinate; the file has OpenCV's root of the mean of dx^2 + dy^2."""
     storage = cv2.FileStorage("camera.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("camera_name", name)
@@ -67,23 +67,23 @@ def opencv_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
     return storage.releaseAndGetString()
 
 
-def ros_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
+def format_ros_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
     """ROS camera_info."""
     matrix = lens.matrix
     entries: dict[str, object] = {
         "image_width": lens.image_size[0],
         "image_height": lens.image_size[1],
         "camera_name": name,
-        "camera_matrix": _ros_matrix(matrix),
+        "camera_matrix": _format_ros_matrix(matrix),
         "distortion_model": "plumb_bob" if len(lens.distortion) == 5 else "rational_polynomial",
-        "distortion_coefficients": _ros_matrix(lens.distortion[None]),
-        "rectification_matrix": _ros_matrix(np.eye(3)),
-        "projection_matrix": _ros_matrix(np.column_stack([matrix, np.zeros(3)])),
+        "distortion_coefficients": _format_ros_matrix(lens.distortion[None]),
+        "rectification_matrix": _format_ros_matrix(np.eye(3)),
+        "projection_matrix": _format_ros_matrix(np.column_stack([matrix, np.zeros(3)])),
     }
     return yaml.safe_dump(entries, sort_keys=False, default_flow_style=None)
 
 
-def kalibr_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
+def format_kalibr_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
     """Kalibr's camchain with the refitted camera."""
     vector = refit_radtan(lens).lens.vector.tolist()
     camera = {
@@ -97,7 +97,7 @@ def kalibr_yaml(lens: Pinhole, name: str, rms_px: float) -> str:
     return yaml.safe_dump({"cam0": camera}, sort_keys=False, default_flow_style=None)
 
 
-def mrcal_cameramodel(lens: Pinhole, name: str, rms_px: float) -> str:
+def format_mrcal_cameramodel(lens: Pinhole, name: str, rms_px: float) -> str:
     """mrcal's .cameramodel: a Python literal, the camera at the origin."""
     entries = {
         "lensmodel": f"LENSMODEL_OPENCV{len(lens.distortion)}",
@@ -111,10 +111,10 @@ def mrcal_cameramodel(lens: Pinhole, name: str, rms_px: float) -> str:
 
 
 EXPORTS: Mapping[str, Callable[[Pinhole, str, float], str]] = {
-    "opencv.yaml": opencv_yaml,
-    "ros_camera_info.yaml": ros_yaml,
-    "kalibr_camchain.yaml": kalibr_yaml,
-    "mrcal.cameramodel": mrcal_cameramodel,
+    "opencv.yaml": format_opencv_yaml,
+    "ros_camera_info.yaml": format_ros_yaml,
+    "kalibr_camchain.yaml": format_kalibr_yaml,
+    "mrcal.cameramodel": format_mrcal_cameramodel,
 }
 """File name -> its writer, called with the camera, its name and the reprojection's RMS per coordinate, px."""
 
@@ -125,8 +125,8 @@ def write_exports(folder: Path, lens: Pinhole, name: str, rms_px: float) -> None
     texts = {file: writer(lens, name, rms_px) for file, writer in EXPORTS.items()}
     make_folder(folder)
     for file, text in texts.items():
-        write_whole(folder / file, text)
+        write_atomically(folder / file, text)
 
 
-def _ros_matrix(matrix: Float) -> dict[str, object]:
+def _format_ros_matrix(matrix: Float) -> dict[str, object]:
     return {"rows": matrix.shape[0], "cols": matrix.shape[1], "data": matrix.ravel().tolist()}

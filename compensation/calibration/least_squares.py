@@ -47,7 +47,7 @@ def minimise(
     """Minimise the sum of squares of residuals r (m,).
 
     equations: J' J (n, n) and J' r (n,) of a state and its residuals, with their derivatives J (m, n) with respect to
-    `step`'s vector; see `dense`.
+    `step`'s vector; see `make_equations`.
 
     CalibrationError when it does not converge, or when some parameter leaves all residuals unchanged.
     """
@@ -55,13 +55,13 @@ def minimise(
     current = residuals(state)
     for _ in range(_STEPS):
         normal, gradient = equations(state, current)
-        scale = _scale(normal)
+        scale = _compute_scale(normal)
         while True:
-            change = -scale * _solved(normal * scale[:, None] * scale, gradient * scale, damping)
+            change = -scale * _solve_damped(normal * scale[:, None] * scale, gradient * scale, damping)
             cost = float(current @ current)
             expected = -float(change @ (2 * gradient + normal @ change))
             if expected <= _CONVERGED * max(cost, 1.0):
-                return Solution(state, cost, _inverse(normal, scale))
+                return Solution(state, cost, _invert(normal, scale))
             tried = step(state, change)
             after = residuals(tried)
             gain = (cost - float(after @ after)) / expected
@@ -75,7 +75,7 @@ def minimise(
     raise CalibrationError(f"the fit does not converge in {_STEPS} steps")
 
 
-def dense(jacobian: Callable[[State], Float]) -> Callable[[State, Float], tuple[Float, Float]]:
+def make_equations(jacobian: Callable[[State], Float]) -> Callable[[State, Float], tuple[Float, Float]]:
     """The equations of derivatives (m, n) that are written out."""
 
     def equations(state: State, residuals: Float) -> tuple[Float, Float]:
@@ -85,31 +85,31 @@ def dense(jacobian: Callable[[State], Float]) -> Callable[[State, Float], tuple[
     return equations
 
 
-def whiteners(covariance: Float) -> Float:
+def compute_whiteners(covariance: Float) -> Float:
     """Matrices (..., n, n) that give vectors of these covariances (..., n, n) unit variance."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
 
 
-def next_discrepancy(sigma2_px2: float, discrepancy_px: float, excess: float) -> float:
+def update_discrepancy(sigma2_px2: float, discrepancy_px: float, excess: float) -> float:
     """The discrepancy with which the squares would be as expected if residuals stayed as they are. excess: the squares
     over their expectation. sigma2_px2: variance of the detection."""
     return float(np.sqrt(max(0.0, (sigma2_px2 + discrepancy_px**2) * excess - sigma2_px2)))
 
 
-def lengths_in_sigmas(residuals_px: Float, covariance_px2: Float, discrepancy_px: float) -> Float:
+def compute_normalised_lengths(residuals_px: Float, covariance_px2: Float, discrepancy_px: float) -> Float:
     """(M,): lengths of residuals (M, 2) in units of what noise (M, 2, 2) and discrepancy make likely."""
     inverse = np.linalg.inv(covariance_px2 + discrepancy_px**2 * np.eye(2))
     return np.sqrt(np.einsum("mi,mij,mj->m", residuals_px, inverse, residuals_px))
 
 
-def _scale(normal: Float) -> Float:
+def _compute_scale(normal: Float) -> Float:
     diagonal = np.diag(normal)
     if not np.all(np.isfinite(diagonal)) or np.any(diagonal <= 0):
         raise CalibrationError("the observations do not determine all parameters")
     return 1 / np.sqrt(diagonal)
 
 
-def _solved(scaled: Float, gradient: Float, damping: float) -> Float:
+def _solve_damped(scaled: Float, gradient: Float, damping: float) -> Float:
     """The damped step; damping grows until the matrix is positive definite."""
     identity = np.eye(len(scaled))
     while damping <= _GREATEST_DAMPING:
@@ -120,7 +120,7 @@ def _solved(scaled: Float, gradient: Float, damping: float) -> Float:
     raise CalibrationError("the observations do not determine all parameters")
 
 
-def _inverse(normal: Float, scale: Float) -> Float:
+def _invert(normal: Float, scale: Float) -> Float:
     try:
         factor = cho_factor(normal * scale[:, None] * scale)
     except LinAlgError as error:

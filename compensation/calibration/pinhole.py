@@ -19,7 +19,7 @@ from thermostand.compensation.calibration.least_squares import Float
 from thermostand.foundation.errors import CalibrationError
 
 
-def crosses(vectors: Float) -> Float:
+def make_cross_matrices(vectors: Float) -> Float:
     """Matrices (..., 3, 3) that multiply by `vectors` x from the left."""
     matrices = np.zeros((*vectors.shape, 3))
     for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
@@ -28,17 +28,17 @@ def crosses(vectors: Float) -> Float:
     return matrices
 
 
-def seen_points(rotations: Float, translations_mm: Float, points_mm: Float) -> Float:
+def transform_points(rotations: Float, translations_mm: Float, points_mm: Float) -> Float:
     """(P, N, 3): points (N, 3) at poses (P, 3, 3) and (P, 3), in the camera's frame, mm."""
     return np.einsum("pij,nj->pni", rotations, points_mm) + translations_mm[:, None]
 
 
-def across(axis: Float) -> Float:
+def find_perpendiculars(axis: Float) -> Float:
     """(3, 2): unit vectors at right angles to a unit vector (3,) and each other, steady when it turns a little."""
     coordinate = np.eye(3)[np.argmin(np.abs(axis))]
     first = coordinate - axis * (axis @ coordinate)
     first = first / np.linalg.norm(first)
-    return np.column_stack([first, crosses(axis) @ first])
+    return np.column_stack([first, make_cross_matrices(axis) @ first])
 
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
@@ -107,50 +107,52 @@ class Pinhole:
         fx, fy, cx, cy = self.vector[:4]
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
-    def stepped(self, change: Float) -> Pinhole:
+    def apply_step(self, change: Float) -> Pinhole:
         """The camera with `change` added to its vector."""
         return replace(self, vector=self.vector + change)
 
     def project(self, points_mm: Float) -> Float:
         """Images (..., 2), px, of points (..., 3) of the camera frame."""
-        return _distorted(points_mm[..., :2] / points_mm[..., 2:], self.distortion) * self.focal_px + self.vector[2:4]
+        return _distort(points_mm[..., :2] / points_mm[..., 2:], self.distortion) * self.focal_px + self.vector[2:4]
 
-    def slopes(self, pixels: Float) -> Float:
+    def compute_slopes(self, pixels: Float) -> Float:
         """(..., 2): X/Z and Y/Z of the rays that are seen at `pixels` (..., 2); NaN where the lens folds over."""
         wanted = (pixels - self.vector[2:4]) / self.focal_px
         slopes = wanted.copy()
         for _ in range(_UNDISTORTIONS):
-            off = wanted - _distorted(slopes, self.distortion)
+            off = wanted - _distort(slopes, self.distortion)
             if np.abs(off).max(initial=0.0) < _UNDISTORTED:
                 break
-            slopes = slopes + np.linalg.solve(_bend(slopes, self.distortion), off[..., None])[..., 0]
-        off = np.abs(wanted - _distorted(slopes, self.distortion)).max(axis=-1)
-        above, below, _ = _radial(np.sum(slopes**2, axis=-1), self.distortion)
-        upright = (above / below > 0) & (np.linalg.det(_bend(slopes, self.distortion)) > 0)
+            slopes = (
+                slopes + np.linalg.solve(_compute_distortion_jacobian(slopes, self.distortion), off[..., None])[..., 0]
+            )
+        off = np.abs(wanted - _distort(slopes, self.distortion)).max(axis=-1)
+        above, below, _ = _compute_radial_factor(np.sum(slopes**2, axis=-1), self.distortion)
+        upright = (above / below > 0) & (np.linalg.det(_compute_distortion_jacobian(slopes, self.distortion)) > 0)
         return np.where(((off < 1e-10) & upright)[..., None], slopes, np.nan)
 
-    def misfit(self, points_mm: Float, pixels: Float) -> Float:
+    def compute_misfit(self, points_mm: Float, pixels: Float) -> Float:
         """Where points (..., 3) are seen, minus where they should be, px."""
         return self.project(points_mm) - pixels
 
-    def point_jacobian(self, points_mm: Float, pixels: Float) -> Float:
+    def compute_point_jacobian(self, points_mm: Float, pixels: Float) -> Float:
         """Derivative (..., 2, 3) of the misfit with respect to the points, px/mm."""
         slopes = points_mm[..., :2] / points_mm[..., 2:]
-        bend = self.focal_px[:, None] * _bend(slopes, self.distortion)
+        bend = self.focal_px[:, None] * _compute_distortion_jacobian(slopes, self.distortion)
         return np.concatenate([bend, -bend @ slopes[..., None]], axis=-1) / points_mm[..., None, 2:]
 
-    def vector_jacobian(self, points_mm: Float) -> Float:
+    def compute_vector_jacobian(self, points_mm: Float) -> Float:
         """Derivative (..., 2, 9 or 12) of the projection with respect to the camera's vector."""
         slopes = points_mm[..., :2] / points_mm[..., 2:]
-        lens = _lens_jacobian(slopes, self.distortion) * self.focal_px[:, None]
-        distorted = _distorted(slopes, self.distortion)
+        lens = _compute_coefficient_jacobian(slopes, self.distortion) * self.focal_px[:, None]
+        distorted = _distort(slopes, self.distortion)
         frame = np.zeros((*slopes.shape, 4))
         frame[..., 0, 0], frame[..., 1, 1] = distorted[..., 0], distorted[..., 1]
         frame[..., 0, 2] = frame[..., 1, 3] = 1.0
         return np.concatenate([frame, lens], axis=-1)
 
 
-def _radial(square: Float, distortion: Float) -> tuple[Float, Float, Float]:
+def _compute_radial_factor(square: Float, distortion: Float) -> tuple[Float, Float, Float]:
     """Numerator, denominator and g'(r^2) of the radial factor."""
     k1, k2, _, _, k3 = distortion[:5]
     k4, k5, k6 = distortion[5:] if len(distortion) > 5 else (0.0, 0.0, 0.0)
@@ -161,11 +163,11 @@ def _radial(square: Float, distortion: Float) -> tuple[Float, Float, Float]:
     return above, below, (above_slope * below - above * below_slope) / below**2
 
 
-def _distorted(slopes: Float, distortion: Float) -> Float:
+def _distort(slopes: Float, distortion: Float) -> Float:
     x, y = slopes[..., 0], slopes[..., 1]
     p1, p2 = distortion[2:4]
     square = x**2 + y**2
-    above, below, _ = _radial(square, distortion)
+    above, below, _ = _compute_radial_factor(square, distortion)
     gain = above / below
     distorted = np.empty_like(slopes)
     distorted[..., 0] = x * gain + 2 * p1 * x * y + p2 * (square + 2 * x**2)
@@ -173,11 +175,11 @@ def _distorted(slopes: Float, distortion: Float) -> Float:
     return distorted
 
 
-def _bend(slopes: Float, distortion: Float) -> Float:
+def _compute_distortion_jacobian(slopes: Float, distortion: Float) -> Float:
     """Derivative (..., 2, 2) of the distorted with respect to the ideal slopes."""
     x, y = slopes[..., 0], slopes[..., 1]
     p1, p2 = distortion[2:4]
-    above, below, gain_slope = _radial(x**2 + y**2, distortion)
+    above, below, gain_slope = _compute_radial_factor(x**2 + y**2, distortion)
     gain = above / below
     bend = np.empty((*slopes.shape, 2))
     bend[..., 0, 0] = gain + 2 * x**2 * gain_slope + 2 * p1 * y + 6 * p2 * x
@@ -186,11 +188,11 @@ def _bend(slopes: Float, distortion: Float) -> Float:
     return bend
 
 
-def _lens_jacobian(slopes: Float, distortion: Float) -> Float:
+def _compute_coefficient_jacobian(slopes: Float, distortion: Float) -> Float:
     """Derivative (..., 2, 5 or 8) of the distorted slopes with respect to the distortion."""
     x, y = np.moveaxis(slopes, -1, 0)
     square = x**2 + y**2
-    above, below, _ = _radial(square, distortion)
+    above, below, _ = _compute_radial_factor(square, distortion)
     powers = [square, square**2, square**3]
     radial = [power / below for power in powers]
     tangential = [

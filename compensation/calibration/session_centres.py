@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.calibration.least_squares import Float
-from thermostand.compensation.one_camera import channel_of
+from thermostand.compensation.camera_selection import find_channel
 from thermostand.foundation.errors import CalibrationError, SessionError
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.progress import Report
 from thermostand.markers.detection import Detection, DetectionError, detect
 from thermostand.markers.target import Target
-from thermostand.recording.format.decoded_items import frame_of
+from thermostand.recording.format.decoded_items import decode_frame
 from thermostand.recording.reading.session import Session
 
 
@@ -37,7 +37,7 @@ class MeanCentres:
     degrees: int
 
 
-def mean_centres(centres_px: Float, covariance_px2: Float) -> MeanCentres:
+def average_centres(centres_px: Float, covariance_px2: Float) -> MeanCentres:
     """Of frames' centres (F, N, 2) and covariances (F, N, 2, 2); NaN where a frame lacks a marker."""
     good = np.isfinite(centres_px[:, :, 0])
     information = np.zeros_like(covariance_px2)
@@ -53,7 +53,7 @@ def mean_centres(centres_px: Float, covariance_px2: Float) -> MeanCentres:
     return MeanCentres(mean, covariance, squares, 2 * int(good.sum() - seen.sum()))
 
 
-def scatter_chi(means: list[MeanCentres]) -> float:
+def compute_scatter_chi(means: list[MeanCentres]) -> float:
     """Scatter of the frames about their means over the scatter predicted; NaN when there is one frame each."""
     degrees = sum(mean.degrees for mean in means)
     return float(np.sqrt(sum(mean.squares for mean in means) / degrees)) if degrees else float("nan")
@@ -74,7 +74,7 @@ class TableVisit:
     until_ns: dict[str, int]
 
 
-def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, TableVisit]:
+def list_visits(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, TableVisit]:
     """Step id -> visit of the captures with one of these roles, in order; SessionError when an axis was not moved
     before one."""
     sent: dict[str, float] = {}
@@ -96,7 +96,7 @@ def visits_for(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, T
     return visits
 
 
-def place(session: Session, axis: Axis, visit: TableVisit) -> float:
+def read_position(session: Session, axis: Axis, visit: TableVisit) -> float:
     """Mean of what the axis reported at rest during the visit, else where it was sent; mm or deg."""
     try:
         times_ns, values = session.readings(f"{axis}.position")
@@ -133,7 +133,7 @@ class Views:
         """Of a coordinate, mean over all markers."""
         return float(np.nanmean(np.diagonal(self.covariance_px2, axis1=2, axis2=3)))
 
-    def part(self, chosen: NDArray[np.bool_]) -> Self:
+    def select(self, chosen: NDArray[np.bool_]) -> Self:
         """The pictures chosen (P,)."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return replace(self, **{name: one[chosen] for name, one in values.items() if isinstance(one, np.ndarray)})
@@ -165,7 +165,7 @@ def observe_positions(session: Session, target: Target, report: Report | None = 
 
     SessionError when it has none. CalibrationError when too few show enough of the target.
     """
-    visits = visits_for(session.steps(), {ROLE})
+    visits = list_visits(session.steps(), {ROLE})
     if not visits:
         raise SessionError(
             f"{session.path}: has no capture with the role {ROLE}; record one with the calibration recipe"
@@ -178,16 +178,16 @@ def observe_positions(session: Session, target: Target, report: Report | None = 
         raise CalibrationError(
             f"{session.path}: the target was found at {len(kept)} positions, {_LEAST_POSITIONS} are needed{why}"
         )
-    linear, rotary = (np.array([place(session, axis, visits[step_id]) for step_id in kept]) for axis in AXES)
-    return combined(linear, rotary, [found[step_id] for step_id in kept], size)
+    linear, rotary = (np.array([read_position(session, axis, visits[step_id]) for step_id in kept]) for axis in AXES)
+    return combine_detections(linear, rotary, [found[step_id] for step_id in kept], size)
 
 
-def combined(
+def combine_detections(
     linear_mm: Float, rotary_deg: Float, detections: Sequence[Sequence[Detection]], image_size: tuple[int, int]
 ) -> Positions:
     """The positions of detections: weighted means, whose covariance grows by the scatter where the frames disagree."""
-    means = [_mean(frames) for frames in detections]
-    chi = scatter_chi(means)
+    means = [_average_frames(frames) for frames in detections]
+    chi = compute_scatter_chi(means)
     growth = 1.0 if math.isnan(chi) else max(1.0, chi) ** 2
     return Positions(
         linear_mm=linear_mm,
@@ -201,10 +201,10 @@ def combined(
     )
 
 
-def _mean(frames: Sequence[Detection]) -> MeanCentres:
+def _average_frames(frames: Sequence[Detection]) -> MeanCentres:
     flagged = np.array([found.flags for found in frames]) != 0
     centres = np.where(flagged[:, :, None], np.nan, np.array([found.centres_px for found in frames]))
-    return mean_centres(centres, np.array([found.covariance_px2 for found in frames]))
+    return average_centres(centres, np.array([found.covariance_px2 for found in frames]))
 
 
 def _detect_all(
@@ -214,14 +214,14 @@ def _detect_all(
     previous: Detection | None = None
     size: tuple[int, int] | None = None
     refused = ""
-    own = channel_of(session)
+    own = find_channel(session)
     for number, image in enumerate(session.images(), 1):
         detections = wanted.get(image.meta.step_id) if image.meta.channel == own else None
         if report is not None:
             report(number, f"frame {number} of {session.frame_count}")
         if detections is None:
             continue
-        pixels = frame_of(image).image
+        pixels = decode_frame(image).image
         shape = (pixels.shape[1], pixels.shape[0])
         if size not in (None, shape):
             raise SessionError(f"{session.path}: frame {number - 1} has the size {shape}, those before it {size}")

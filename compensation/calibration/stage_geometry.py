@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermostand.compensation.calibration.least_squares import Float
-from thermostand.compensation.calibration.pinhole import across, crosses
+from thermostand.compensation.calibration.pinhole import find_perpendiculars, make_cross_matrices
 
 PARAMETERS = 12
 """Of a table's step: c (3), l (2), a (2), R0 (3), o (2)."""
@@ -56,18 +56,18 @@ class TableGeometry:
     mount: Float
     offset_mm: Float
 
-    def poses(self, linear_mm: Float, rotary_deg: Float, errors: Float) -> tuple[Float, Float]:
+    def compute_poses(self, linear_mm: Float, rotary_deg: Float, errors: Float) -> tuple[Float, Float]:
         """Rotation matrices (P, 3, 3) and translations (P, 3), mm, from target to camera; errors (P, 6)."""
-        along, about = _frame(self.linear), _frame(self.rotary)
-        turn = Rotation.from_rotvec(errors[:, 3:] @ about.T).as_matrix() @ self.turns(rotary_deg)
+        along, about = _make_axis_frame(self.linear), _make_axis_frame(self.rotary)
+        turn = Rotation.from_rotvec(errors[:, 3:] @ about.T).as_matrix() @ self.compute_turns(rotary_deg)
         base = self.base_mm + linear_mm[:, None] * self.linear + errors[:, :3] @ along.T
         return turn @ self.mount, base + turn @ self.offset_mm
 
-    def turns(self, rotary_deg: Float) -> Float:
+    def compute_turns(self, rotary_deg: Float) -> Float:
         """Rotation matrices (P, 3, 3) about the rotary axis."""
         return Rotation.from_rotvec(rotary_deg[:, None] * self.rotary, degrees=True).as_matrix()
 
-    def jacobian(
+    def compute_jacobian(
         self, points_mm: Float, linear_mm: Float, rotary_deg: Float, errors: Float
     ) -> tuple[Float, Float, Float]:
         """Derivatives of the points p of target points (M, 3), each at its own position (M,) with its errors (M, 6).
@@ -75,23 +75,25 @@ class TableGeometry:
         With respect to a step of the table (M, 3, 12), to d and w (M, 3, 6), and to the target points (M, 3, 3). Terms
         of second order in w are left out.
         """
-        turn = Rotation.from_rotvec(errors[:, 3:] @ _frame(self.rotary).T).as_matrix() @ self.turns(rotary_deg)
+        turn = Rotation.from_rotvec(errors[:, 3:] @ _make_axis_frame(self.rotary).T).as_matrix() @ self.compute_turns(
+            rotary_deg
+        )
         mounted = points_mm @ self.mount.T
         arm = mounted + self.offset_mm
-        sideways = across(self.rotary)
-        swing = -crosses(np.einsum("mij,mj->mi", turn, arm))  # of a small left rotation
+        sideways = find_perpendiculars(self.rotary)
+        swing = -make_cross_matrices(np.einsum("mij,mj->mi", turn, arm))  # of a small left rotation
         table = np.concatenate(
             [
                 np.broadcast_to(np.eye(3), (len(points_mm), 3, 3)),
-                linear_mm[:, None, None] * across(self.linear),
-                (swing + turn @ crosses(arm)) @ sideways,
-                -turn @ crosses(mounted),
+                linear_mm[:, None, None] * find_perpendiculars(self.linear),
+                (swing + turn @ make_cross_matrices(arm)) @ sideways,
+                -turn @ make_cross_matrices(mounted),
                 turn @ sideways,
             ],
             axis=2,
         )
-        shifts = np.broadcast_to(_frame(self.linear), (len(points_mm), 3, 3))
-        return table, np.concatenate([shifts, swing @ _frame(self.rotary)], axis=2), turn @ self.mount
+        shifts = np.broadcast_to(_make_axis_frame(self.linear), (len(points_mm), 3, 3))
+        return table, np.concatenate([shifts, swing @ _make_axis_frame(self.rotary)], axis=2), turn @ self.mount
 
     @property
     def frame(self) -> Float:
@@ -101,12 +103,12 @@ class TableGeometry:
         down = np.copysign(1.0, self.rotary[1]) * self.rotary
         down = down - self.linear * (self.linear @ down)
         down = down / np.linalg.norm(down)
-        return np.stack([crosses(down) @ self.linear, down, self.linear])
+        return np.stack([make_cross_matrices(down) @ self.linear, down, self.linear])
 
-    def stepped(self, change: Float) -> TableGeometry:
+    def apply_step(self, change: Float) -> TableGeometry:
         """The table a step (12,) away: c, l, a, R0, o in mm and rad."""
-        sideways = across(self.rotary)
-        linear = self.linear + across(self.linear) @ change[3:5]
+        sideways = find_perpendiculars(self.rotary)
+        linear = self.linear + find_perpendiculars(self.linear) @ change[3:5]
         return replace(
             self,
             base_mm=self.base_mm + change[:3],
@@ -117,6 +119,6 @@ class TableGeometry:
         )
 
 
-def _frame(axis: Float) -> Float:
+def _make_axis_frame(axis: Float) -> Float:
     """(3, 3): the axis and two unit vectors across it, as columns."""
-    return np.column_stack([axis, across(axis)])
+    return np.column_stack([axis, find_perpendiculars(axis)])

@@ -16,44 +16,51 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thermostand.compensation.calibration.adjustment import Problem, Slopes, whitened
-from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
+from thermostand.compensation.calibration.adjustment import Problem, Slopes, build_problem_fields
+from thermostand.compensation.calibration.board import Board, compute_camera_shifts, compute_homography_shifts
 from thermostand.compensation.calibration.least_squares import (
     Float,
     Solution,
-    lengths_in_sigmas,
+    compute_normalised_lengths,
     minimise,
-    next_discrepancy,
+    update_discrepancy,
 )
-from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv, crosses, seen_points
+from thermostand.compensation.calibration.pinhole import (
+    Pinhole,
+    calibrate_opencv,
+    make_cross_matrices,
+    transform_points,
+)
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.session_centres import Views
-from thermostand.compensation.calibration.uncertainty import NOT_SEEN, seen
-from thermostand.compensation.drift.hull import convex_hull
+from thermostand.compensation.calibration.uncertainty import NOT_SEEN, is_near_markers
+from thermostand.compensation.drift.hull import compute_convex_hull
 from thermostand.foundation.errors import CalibrationError
 
 COVERAGE = 2.0
 """k: an interval of two standard uncertainties holds 95 %."""
 
 
-def projection_sigma_um(found: ViewCalibration, pixels: Float, distance_mm: float) -> Float:
+def compute_projection_sigma_um(found: ViewCalibration, pixels: Float, distance_mm: float) -> Float:
     """Standard uncertainty (K,), um, across the line of sight, of points seen at pixels (K, 2) at Z = distance_mm: root
     mean square of both coordinates, the camera's part alone, without the noise of a new picture; NaN where no marker
     was seen."""
     lens, scene = found.scene.lens, found.scene
-    points = np.column_stack([lens.slopes(pixels), np.ones(len(pixels))]) * distance_mm
-    by_point, count = lens.point_jacobian(points, pixels), len(scene.rotations)
+    points = np.column_stack([lens.compute_slopes(pixels), np.ones(len(pixels))]) * distance_mm
+    by_point, count = lens.compute_point_jacobian(points, pixels), len(scene.rotations)
     first = len(lens.vector)
     jacobian = np.zeros((len(pixels), 2, first + POSE * count))
-    jacobian[:, :, :first] = lens.vector_jacobian(points)
+    jacobian[:, :, :first] = lens.compute_vector_jacobian(points)
     for view in range(count):
         arm = points - scene.translations_mm[view]
         begin = first + POSE * view
-        jacobian[:, :, begin : begin + POSE] = np.concatenate([-by_point @ crosses(arm), by_point], axis=2) / count
+        jacobian[:, :, begin : begin + POSE] = (
+            np.concatenate([-by_point @ make_cross_matrices(arm), by_point], axis=2) / count
+        )
     known = found.covariance[: jacobian.shape[2], : jacobian.shape[2]]
     variance_px2 = np.trace(jacobian @ known @ np.swapaxes(jacobian, 1, 2), axis1=1, axis2=2) / 2
     sigma_um = 1e3 * np.sqrt(variance_px2) * distance_mm / float(lens.focal_px.mean())
-    return np.where(seen(pixels, found.hull_px), sigma_um, np.nan)
+    return np.where(is_near_markers(pixels, found.hull_px), sigma_um, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,28 +79,28 @@ class PointUncertainty:
     def text(self) -> str:
         """`a point at 1000 mm is known to (k = 2): 3.1 um in the middle of the picture, 9 um at its worst corner`."""
         unseen = self.corners_um.count(None)
-        middle = "not seen" if self.middle_um is None else _two_digits(self.middle_um)
+        middle = "not seen" if self.middle_um is None else _format_um(self.middle_um)
         worst = "where it is worst among the markers" if unseen else "at its worst corner"
         corners = f"; {unseen} of its 4 corners: {self.not_seen}" if unseen else ""
         return (
             f"a point at {self.distance_mm:.0f} mm is known to (k = {COVERAGE:g}, without its own picture's noise): "
-            f"{middle} in the middle of the picture, {_two_digits(self.worst_seen_um)} {worst}{corners}"
+            f"{middle} in the middle of the picture, {_format_um(self.worst_seen_um)} {worst}{corners}"
         )
 
 
-def known(found: ViewCalibration, distance_mm: float) -> PointUncertainty:
+def compute_point_uncertainty(found: ViewCalibration, distance_mm: float) -> PointUncertainty:
     """How well it knows points at Z = distance_mm."""
     width, height = found.scene.lens.image_size
     corners = [(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)]
     pixels = np.array([((width - 1) / 2, (height - 1) / 2), *corners], np.float64)
     everywhere = np.concatenate([pixels, found.hull_px])
-    sigma_um = COVERAGE * projection_sigma_um(found, everywhere, distance_mm)
+    sigma_um = COVERAGE * compute_projection_sigma_um(found, everywhere, distance_mm)
     middle, *at_corners = [None if np.isnan(um) else float(um) for um in sigma_um[: len(pixels)]]
     not_seen = NOT_SEEN if None in (middle, *at_corners) else ""
     return PointUncertainty(distance_mm, middle, tuple(at_corners), float(np.nanmax(sigma_um)), not_seen)
 
 
-def _two_digits(value_um: float) -> str:
+def _format_um(value_um: float) -> str:
     """3.1 um, 47 um, 960 um: never with an exponent."""
     return f"{float(f'{value_um:.2g}'):g} um"
 
@@ -113,7 +120,7 @@ _FOLDS = 5  # the usual number; time grows in proportion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posed:
+class PosedScene:
     """Camera, rotations (P, 3, 3) and translations (P, 3), mm, of the views, and board points (N, 3), mm."""
 
     lens: Pinhole
@@ -121,9 +128,9 @@ class Posed:
     translations_mm: Float
     points_mm: Float
 
-    def seen_points(self) -> Float:
+    def transform_points(self) -> Float:
         """(P, N, 3): the board's points in the camera's frame, mm."""
-        return seen_points(self.rotations, self.translations_mm, self.points_mm)
+        return transform_points(self.rotations, self.translations_mm, self.points_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +138,7 @@ class ViewCalibration:
     """covariance: of a step of lens, views and board points, in this order. residuals_px (P, N, 2): computed minus
     measured, NaN where not used. discrepancy_px: what noise and board leave unexplained per coordinate."""
 
-    scene: Posed
+    scene: PosedScene
     board: Board
     covariance: Float
     residuals_px: Float
@@ -141,7 +148,9 @@ class ViewCalibration:
     def hull_px(self) -> Float:
         """(H, 2): of the markers that were used, where they are computed to be seen."""
         scene = self.scene
-        return convex_hull(scene.lens.project(scene.seen_points()[np.isfinite(self.residuals_px[:, :, 0])]))
+        return compute_convex_hull(
+            scene.lens.project(scene.transform_points()[np.isfinite(self.residuals_px[:, :, 0])])
+        )
 
     @property
     def lens_sigma(self) -> Float:
@@ -176,44 +185,46 @@ def calibrate_views(views: Views, board: Board) -> ViewCalibration:
     """
     if len(views.centres_px) < LEAST_VIEWS:
         raise CalibrationError(f"{len(views.centres_px)} pictures show the target, {LEAST_VIEWS} are needed")
-    homographic = [shifts_by_homography(one, board.points_mm, board.diameters_mm) for one in views.centres_px]
+    homographic = [compute_homography_shifts(one, board.points_mm, board.diameters_mm) for one in views.centres_px]
     start = calibrate_opencv(views.centres_px - np.array(homographic), board.points_mm, views.image_size)
     _require_tilt(start.rotations)
-    scene = Posed(start.lens, start.rotations, start.translations_mm, board.points_mm)
+    scene = PosedScene(start.lens, start.rotations, start.translations_mm, board.points_mm)
     used, discrepancy_px = views.seen, 0.0
-    solution, residuals, chi2 = _round(scene, views, used, board, discrepancy_px)
+    solution, residuals, chi2 = _adjust_once(scene, views, used, board, discrepancy_px)
     for _ in range(_ROUNDS):
         # Of the start the discs' eccentricities are only roughly right: there is always a second round.
         explained = chi2 <= 1 + _SETTLED and (discrepancy_px == 0 or chi2 >= 1 - _SETTLED)
         before = used
         if explained:
-            used = inliers(residuals, views, discrepancy_px)
+            used = find_inliers(residuals, views, discrepancy_px)
         else:
-            discrepancy_px = next_discrepancy(views.variance_px2, discrepancy_px, chi2)
-        solution, residuals, chi2 = _round(solution.state, views, used, board, discrepancy_px)
+            discrepancy_px = update_discrepancy(views.variance_px2, discrepancy_px, chi2)
+        solution, residuals, chi2 = _adjust_once(solution.state, views, used, board, discrepancy_px)
         if explained and np.array_equal(before, used):
             break
     kept = np.where(used[:, :, None], residuals, np.nan)
     return ViewCalibration(solution.state, board, solution.covariance, kept, discrepancy_px)
 
 
-def _round(
-    scene: Posed, views: Views, used: NDArray[np.bool_], board: Board, discrepancy_px: float
-) -> tuple[Solution[Posed], Float, float]:
+def _adjust_once(
+    scene: PosedScene, views: Views, used: NDArray[np.bool_], board: Board, discrepancy_px: float
+) -> tuple[Solution[PosedScene], Float, float]:
     """The fit with the eccentricities of `scene`, its residuals (P, N, 2), px, and chi^2 per degree of freedom."""
-    shifts = shifts_by_camera(
+    shifts = compute_camera_shifts(
         scene.lens.project, scene.rotations, scene.translations_mm, scene.points_mm, board.diameters_mm
     )
     problem = _PosedProblem(
-        **whitened(views, board, lens=scene.lens, shifts_px=shifts, used=used, discrepancy_px=discrepancy_px)
+        **build_problem_fields(
+            views, board, lens=scene.lens, shifts_px=shifts, used=used, discrepancy_px=discrepancy_px
+        )
     )
-    solution = minimise(scene, problem.residuals, problem.equations, problem.stepped)
+    solution = minimise(scene, problem.compute_residuals, problem.build_equations, problem.apply_step)
     state = solution.state
-    chi2 = solution.cost / (len(problem.residuals(state)) - len(solution.covariance))
-    return solution, state.lens.project(state.seen_points()) - (views.centres_px - shifts), chi2
+    chi2 = solution.cost / (len(problem.compute_residuals(state)) - len(solution.covariance))
+    return solution, state.lens.project(state.transform_points()) - (views.centres_px - shifts), chi2
 
 
-def cross_validated_px(views: Views, board: Board) -> float:
+def cross_validate_px(views: Views, board: Board) -> float:
     """Root mean square residual per coordinate of pictures that the calibration has not seen, about the poses found
     from them, corrected for the poses' six degrees of freedom. CalibrationError when that cannot be told, as the
     pictures without those that are held out do not determine a camera."""
@@ -223,8 +234,8 @@ def cross_validated_px(views: Views, board: Board) -> float:
     fold = np.arange(len(views.centres_px)) % _FOLDS
     squares: list[float] = []
     for number in range(_FOLDS):
-        found = calibrate_views(views.part(fold != number), board)
-        held = views.part(fold == number)
+        found = calibrate_views(views.select(fold != number), board)
+        held = views.select(fold == number)
         for centres, covariance in zip(held.centres_px, held.covariance_px2, strict=True):
             pose = find_pose(found.scene.lens, found.adjusted_board, centres, covariance)
             residuals = pose.residuals_px[np.isfinite(centres[:, 0])]
@@ -245,43 +256,43 @@ def _require_tilt(rotations: Float) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _PosedProblem(Problem[Posed]):
+class _PosedProblem(Problem[PosedScene]):
     """Each view has a pose of its own, of which nothing is known beforehand."""
 
-    def seen_points(self, scene: Posed) -> Float:
-        return self._turned(scene) + scene.translations_mm[self.picture]
+    def transform_points(self, scene: PosedScene) -> Float:
+        return self._rotate_points(scene) + scene.translations_mm[self.picture]
 
-    def _turned(self, scene: Posed) -> Float:
+    def _rotate_points(self, scene: PosedScene) -> Float:
         """(M, 3): the used markers turned as in their views."""
         return np.einsum("mij,mj->mi", scene.rotations[self.picture], scene.points_mm[self.marker])
 
-    def slopes(self, scene: Posed) -> Slopes:
+    def compute_slopes(self, scene: PosedScene) -> Slopes:
         """Derivatives of the markers' residuals with respect to camera, pose and board point."""
-        turned, seen = self._turned(scene), self.seen_points(scene)
-        by_point = self.whitener @ scene.lens.point_jacobian(seen, self.centres_px)
+        turned, seen = self._rotate_points(scene), self.transform_points(scene)
+        by_point = self.whitener @ scene.lens.compute_point_jacobian(seen, self.centres_px)
         return Slopes(
             self.picture,
             self.marker,
-            self.whitener @ scene.lens.vector_jacobian(seen),
-            np.concatenate([-by_point @ crosses(turned), by_point], axis=2),
+            self.whitener @ scene.lens.compute_vector_jacobian(seen),
+            np.concatenate([-by_point @ make_cross_matrices(turned), by_point], axis=2),
             by_point @ scene.rotations[self.picture],
         )
 
-    def stepped(self, scene: Posed, change: Float) -> Posed:
+    def apply_step(self, scene: PosedScene, change: Float) -> PosedScene:
         lens = len(scene.lens.vector)
         poses = change[lens : len(change) - scene.points_mm.size].reshape(-1, POSE)
-        return Posed(
-            scene.lens.stepped(change[:lens]),
+        return PosedScene(
+            scene.lens.apply_step(change[:lens]),
             Rotation.from_rotvec(poses[:, :3]).as_matrix() @ scene.rotations,
             scene.translations_mm + poses[:, 3:],
             scene.points_mm + change[-scene.points_mm.size :].reshape(-1, 3),
         )
 
 
-def inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:
+def find_inliers(residuals_px: Float, views: Views, discrepancy_px: float) -> NDArray[np.bool_]:
     """Markers not far outside the scatter, unless those that are would be too many for accidents."""
     seen = views.seen
-    lengths = lengths_in_sigmas(residuals_px[seen], views.covariance_px2[seen], discrepancy_px)
+    lengths = compute_normalised_lengths(residuals_px[seen], views.covariance_px2[seen], discrepancy_px)
     kept = seen.copy()
     if np.mean(lengths > _OUTLIER) <= _MOST_OUTLIERS:
         kept[seen] = lengths <= _OUTLIER

@@ -11,19 +11,29 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from thermostand.compensation.apply.compensate_images import Form, corrected_image, middle_flags, write_image
-from thermostand.compensation.apply.runtime_export import export, export_c, export_ros2
-from thermostand.compensation.arrays import Row, numbers, read_rows
+from thermostand.compensation.apply.image_correction import (
+    ImageFormat,
+    compute_middle_flags,
+    correct_image,
+    write_image,
+)
+from thermostand.compensation.apply.runtime_export import export_c, export_ros2, export_runtime
+from thermostand.compensation.array_observations import Row, parse_column, read_rows
+from thermostand.compensation.camera_selection import (
+    find_camera_name,
+    list_camera_frames,
+    read_frame_temperatures,
+    select_camera,
+)
 from thermostand.compensation.commands.options import CameraName, Incomplete, open_session
 from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift.paper_model import PaperModel
-from thermostand.compensation.history.thermal_history import Float, States, recorded_history, states_at
-from thermostand.compensation.one_camera import name_of, own_frames, take, temperatures_at_frames
+from thermostand.compensation.history.thermal_history import Float, States, compute_states_at, read_history
 from thermostand.experiments.steps import Role
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.files import check_writable, whole_file
+from thermostand.foundation.files import check_writable, open_atomic
 from thermostand.foundation.instants import parse_instant
 from thermostand.foundation.output import say, show
 from thermostand.foundation.progress import progress
@@ -45,7 +55,7 @@ def read_points(path: Path) -> list[dict[str, str]]:
     return rows
 
 
-def times(path: Path, rows: Sequence[Row]) -> list[int]:
+def parse_times(path: Path, rows: Sequence[Row]) -> list[int]:
     """(M,): the instants, ns; ConfigError when a row has none."""
     found: list[int] = []
     for line, row in enumerate(rows, 2):
@@ -64,20 +74,22 @@ def write_corrected(path: Path, rows: Sequence[Row], xy_px: Float, model: DriftM
     """
     corrected, covariance = model.correct(xy_px, states), model.covariance(xy_px, states)
     flags = model.flags(xy_px, states)
-    with whole_file(path) as file:
+    with open_atomic(path) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*(rows[0] if rows else (X, Y)), *ADDED])
         for index, row in enumerate(rows):
-            writer.writerow([*row.values(), *_added(corrected[index], covariance[index], int(flags[index]))])
+            writer.writerow(
+                [*row.values(), *_format_added_cells(corrected[index], covariance[index], int(flags[index]))]
+            )
 
 
-def _added(place_px: Float, covariance_px2: Float, flags: int) -> Iterator[str]:
+def _format_added_cells(place_px: Float, covariance_px2: Float, flags: int) -> Iterator[str]:
     yield from (f"{value:.6f}" for value in place_px)
     yield from (f"{value:.6e}" for value in (covariance_px2[0, 0], covariance_px2[0, 1], covariance_px2[1, 1]))
-    yield outside_text(flags)
+    yield format_outside(flags)
 
 
-def outside_text(flags: int) -> str:
+def format_outside(flags: int) -> str:
     """The names of the flags joined by `|`, empty when there is none."""
     return "|".join(flag.name or "" for flag in Outside(flags))
 
@@ -108,7 +120,7 @@ def apply_model(
         str | None, typer.Option(metavar="FIRST:END", help="Of a session: these frames, counted from 0, without END.")
     ] = None,
     form: Annotated[
-        Form, typer.Option("--format", help="Of images: tiff is float32, png rounded to the original's bits.")
+        ImageFormat, typer.Option("--format", help="Of images: tiff is float32, png rounded to the original's bits.")
     ] = "tiff",
     camera: CameraName = None,
     incomplete: Incomplete = False,
@@ -125,28 +137,28 @@ def apply_model(
     if source.is_dir():
         own = "a session has temperatures of its own"
         _refuse(("--session", session), ("--camera-degC", camera_degC), ("--time", time), why=own)
-        _correct_session(used, _opened(source, used, camera, incomplete), out, frames, form)
+        _correct_session(used, _open_session(source, used, camera, incomplete), out, frames, form)
     elif source.suffix.lower() == ".csv":
         _refuse(("--frames", frames), why="it selects frames of a session")
         _refuse(("--time", time), why="the points have a column time_ns")
         check_writable(out)
-        recorded = None if session is None else _opened(session, used, camera, incomplete)
+        recorded = None if session is None else _open_session(session, used, camera, incomplete)
         used = _correct_points(used, source, out, recorded, camera_degC)
     else:
         _refuse(("--frames", frames), why="it selects frames of a session")
-        recorded = None if session is None else _opened(session, used, camera, incomplete)
-        used, states = _of_image(used, source, recorded, time, camera_degC)
+        recorded = None if session is None else _open_session(session, used, camera, incomplete)
+        used, states = _select_image_state(used, source, recorded, time, camera_degC)
         check_writable(out)
         image = read_image(source)
-        write_image(out, corrected_image(image, used, states), form, image.dtype)
-        _warn(middle_flags(used, states))
+        write_image(out, correct_image(image, used, states), form, image.dtype)
+        _warn(compute_middle_flags(used, states))
     show({"out": out, "form": used.form}, ())
 
 
-def _opened(path: Path, model: DriftModel, camera: str | None, incomplete: bool) -> Session:
+def _open_session(path: Path, model: DriftModel, camera: str | None, incomplete: bool) -> Session:
     session = open_session(path, camera, incomplete)
     if camera is None:
-        take(session, name_of(session, model.facts.camera_serial))
+        select_camera(session, find_camera_name(session, model.facts.camera_serial))
     _offer_rereference(model, session)
     return session
 
@@ -165,7 +177,7 @@ def _offer_rereference(model: DriftModel, session: Session) -> None:
         )
 
 
-def _of_image(
+def _select_image_state(
     model: DriftModel, source: Path, session: Session | None, time: str | None, camera_degC: float | None
 ) -> tuple[DriftModel, States]:
     """The form for one image, and the thermal state it was taken in."""
@@ -173,18 +185,18 @@ def _of_image(
         _refuse(("--time", time), why="it is an instant of a session; give --session as well")
         if camera_degC is None:
             raise ConfigError(f"{source}: give the camera's temperature with --camera-degC, or --session and --time")
-        used = _without_history(model)
+        used = _select_temperature_form(model)
         return used, States.at_degC(camera_degC, 1, used.memory)
     _refuse(("--camera-degC", camera_degC), why="the session has it")
     if time is None:
         raise ConfigError(f"{source}: say with --time when this image was taken in the session")
-    states = _recorded_states(model, session, [_instant_ns(time, session)])
+    states = _read_recorded_states(model, session, [_parse_instant_ns(time, session)])
     if np.isnan(model.shift(np.zeros((1, 2)), states)).all():
         raise SessionError(f"{source}: {session.path} does not tell the camera's state at {time}")
     return model, states
 
 
-def _instant_ns(text: str, session: Session) -> int:
+def _parse_instant_ns(text: str, session: Session) -> int:
     """time_ns as it is; else a time as people write it, local when it names no zone, by the session's clock."""
     if text.isdecimal():
         return int(text)
@@ -216,7 +228,7 @@ def export_model(
     if out is None and c is None and ros2 is None:
         raise ConfigError("nothing to write: give -o FOLDER for Python, --c FILE.h for C, --ros2 FOLDER for ROS 2")
     used = load_model(model)
-    written = [] if out is None else [*export(used, out)]
+    written = [] if out is None else [*export_runtime(used, out)]
     written += [] if c is None else [export_c(used, c)]
     written += [] if ros2 is None else [*export_ros2(used, ros2)]
     show(written, written)
@@ -233,14 +245,14 @@ def _correct_points(
 ) -> DriftModel:
     """The form that it was done with."""
     rows = read_points(source)
-    xy_px = np.column_stack([numbers(source, rows, X), numbers(source, rows, Y)])
+    xy_px = np.column_stack([parse_column(source, rows, X), parse_column(source, rows, Y)])
     if session is not None:
         _refuse(("--camera-degC", camera_degC), why="the session has it")
-        states = _recorded_states(model, session, times(source, rows))
+        states = _read_recorded_states(model, session, parse_times(source, rows))
         model = model.of_sessions([session.metadata.get("session_id", "")])
     elif camera_degC is not None or (rows and CAMERA in rows[0]):
-        model = _without_history(model)
-        degC = numbers(source, rows, CAMERA) if camera_degC is None else camera_degC
+        model = _select_temperature_form(model)
+        degC = parse_column(source, rows, CAMERA) if camera_degC is None else camera_degC
         states = States.at_degC(degC, len(rows), model.memory)
     else:
         raise ConfigError(f"{source}: has no column {CAMERA}; give --session, or --camera-degC")
@@ -252,7 +264,7 @@ def _correct_points(
     return model
 
 
-def _without_history(model: DriftModel) -> DriftModel:
+def _select_temperature_form(model: DriftModel) -> DriftModel:
     """The form of the model that needs the camera's temperature only, with a message when it is not the one in use;
     ConfigError when the file has none."""
     if isinstance(model, PaperModel):
@@ -270,13 +282,13 @@ def _without_history(model: DriftModel) -> DriftModel:
     return model.other
 
 
-def _recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:
+def _read_recorded_states(model: DriftModel, session: Session, time_ns: Sequence[int]) -> States:
     """The thermal state at each instant, of which the same may come many times and in any order."""
     say(f"corrected with the {model.form} form of the model ({model.title}), by what {session.path.name} recorded")
-    recorded_degC = temperatures_at_frames(session)
+    recorded_degC = read_frame_temperatures(session)
     instants, where = np.unique(np.array(time_ns, np.int64), return_inverse=True)
     camera_degC = np.array([recorded_degC.get(instant, math.nan) for instant in instants.tolist()])
-    return states_at(recorded_history(session), model.memory, instants, camera_degC).where(where)
+    return compute_states_at(read_history(session), model.memory, instants, camera_degC).where(where)
 
 
 def _check_known(model: DriftModel, xy_px: np.ndarray[tuple[int, ...], np.dtype[np.float64]], states: States) -> None:
@@ -287,27 +299,27 @@ def _check_known(model: DriftModel, xy_px: np.ndarray[tuple[int, ...], np.dtype[
         )
 
 
-def _correct_session(model: DriftModel, session: Session, out: Path, frames: str | None, form: Form) -> None:
-    own = own_frames(session)
-    selected = [own[index] for index in _selected(frames, len(own))]
-    states = _recorded_states(model, session, session.frame_times_ns[selected].tolist())
+def _correct_session(model: DriftModel, session: Session, out: Path, frames: str | None, form: ImageFormat) -> None:
+    own = list_camera_frames(session)
+    selected = [own[index] for index in _parse_frame_range(frames, len(own))]
+    states = _read_recorded_states(model, session, session.frame_times_ns[selected].tolist())
     try:
         out.mkdir()
     except OSError as error:
         raise SessionError(f"{out}: cannot be made ({error.strerror}); images go into a new folder") from error
-    with progress("correct images", len(selected)) as report, whole_file(out / "images.csv") as index:
+    with progress("correct images", len(selected)) as report, open_atomic(out / "images.csv") as index:
         writer = csv.writer(index, lineterminator="\n")
         writer.writerow(INDEX_COLUMNS)
         for done, number in enumerate(selected):
             frame, state = session.frame(number), states.where(np.array([done]))
             name = f"{number:06d}.{form}"
-            write_image(out / name, corrected_image(frame.image, model, state), form, frame.image.dtype)
-            outside = outside_text(middle_flags(model, state))
+            write_image(out / name, correct_image(frame.image, model, state), form, frame.image.dtype)
+            outside = format_outside(compute_middle_flags(model, state))
             writer.writerow((name, number, frame.time_ns, f"{frame.camera_degC:z.3f}", outside))
             report(done + 1, name)
 
 
-def _selected(frames: str | None, count: int) -> range:
+def _parse_frame_range(frames: str | None, count: int) -> range:
     """ConfigError when the text is no FIRST:END within the session."""
     if frames is None:
         return range(count)
@@ -323,4 +335,4 @@ def _selected(frames: str | None, count: int) -> range:
 
 def _warn(flags: int) -> None:
     if flags:
-        say(f"warning: outside the model's valid range ({outside_text(flags)})")
+        say(f"warning: outside the model's valid range ({format_outside(flags)})")

@@ -10,24 +10,24 @@ import numpy as np
 import typer
 
 from thermostand.compensation.calibration.calibrate import CameraCalibration, Model, calibrate
-from thermostand.compensation.calibration.camera_file import CameraFile, camera_file
+from thermostand.compensation.calibration.camera_file import CameraFile, build_camera_file
 from thermostand.compensation.calibration.exports import EXPORTS, refit_radtan, write_exports
 from thermostand.compensation.calibration.pinhole import NAMES
 from thermostand.compensation.calibration.session_centres import observe_positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
+from thermostand.compensation.camera_selection import read_serial
 from thermostand.compensation.commands.options import (
     CameraName,
     Incomplete,
     TargetOption,
-    finding_markers,
-    named_target,
+    load_optional_target,
     open_session,
+    report_marker_search,
 )
-from thermostand.compensation.observations import session_target
-from thermostand.compensation.one_camera import serial_of
-from thermostand.compensation.reporting.pages import calibration_page
+from thermostand.compensation.observations import read_session_target
+from thermostand.compensation.reporting.pages import render_calibration_page
 from thermostand.foundation.command_app import App
-from thermostand.foundation.files import check_folder_writable, check_writable, write_whole
+from thermostand.foundation.files import check_folder_writable, check_writable, write_atomically
 from thermostand.foundation.output import show
 from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
@@ -74,23 +74,23 @@ def calibrate_session(
     if export is not None:
         check_folder_writable(export, EXPORTS)
     opened = open_session(session, camera, incomplete)
-    used = named_target(target) or session_target(opened)
+    used = load_optional_target(target) or read_session_target(opened)
     sigma = TableSigma(linear_um / 1e3, rotary_arcmin, straightness_um / 1e3, wobble_arcmin)
-    with finding_markers(opened.frame_count) as shown:
+    with report_marker_search(opened.frame_count) as shown:
         positions = observe_positions(opened, used, shown)
     found = calibrate(positions, used, sigma, model)
-    file = _file(opened, used.name, found, keep_rays=keep_rays)
-    lines = [summary(file, used)]
-    page = None if report is None else calibration_page(file, found)
+    file = _build_file(opened, used.name, found, keep_rays=keep_rays)
+    lines = [format_summary(file, used)]
+    page = None if report is None else render_calibration_page(file, found)
     if report is not None and page is not None:
-        write_whole(report, page)
+        write_atomically(report, page)
     if export is not None:
         write_exports(export, file.lens, file.camera_serial or "camera", file.fit.rms_px)
     file.save(out)
     show(file.model_dump(mode="json"), lines)
 
 
-def summary(file: CameraFile, target: Target) -> str:
+def format_summary(file: CameraFile, target: Target) -> str:
     """The calibration in a few lines."""
     sigma = [file.covariance[index][index] ** 0.5 for index in range(len(file.vector))]
     lines = [f"{file.model}: {file.fit.markers} markers at {len(file.table.linear_mm)} positions"]
@@ -110,7 +110,7 @@ def summary(file: CameraFile, target: Target) -> str:
     if (apart_px := file.uncertainty.halves_rms_px) is not None:
         lines.append(f"the halves differ by {1e3 * apart_px:z.2f} mpx RMS at {file.uncertainty.distance_mm:z.0f} mm")
     lines += file.not_known
-    lines += _projection(file)
+    lines += _format_projection(file)
     if file.rays_doubt:
         lines.append(f"{file.rays_doubt}{'' if file.rays else '. It is not written; --keep-rays writes it'}")
     refit = refit_radtan(file.lens)
@@ -121,7 +121,7 @@ def summary(file: CameraFile, target: Target) -> str:
     return "\n".join(lines)
 
 
-def _projection(file: CameraFile) -> list[str]:
+def _format_projection(file: CameraFile) -> list[str]:
     """Where the projection is known how well, and where nobody has looked."""
     sigma_px = np.array(file.uncertainty.sigma_px, np.float64)
     if not np.isfinite(sigma_px).any():
@@ -133,10 +133,10 @@ def _projection(file: CameraFile) -> list[str]:
     ]
 
 
-def _file(session: Session, target_name: str, found: CameraCalibration, *, keep_rays: bool) -> CameraFile:
-    return camera_file(
+def _build_file(session: Session, target_name: str, found: CameraCalibration, *, keep_rays: bool) -> CameraFile:
+    return build_camera_file(
         found,
-        camera_serial=serial_of(session),
+        camera_serial=read_serial(session),
         session_ids=(session.metadata.get("session_id", ""),),
         target_name=target_name,
         software_version=importlib.metadata.version("thermostand"),

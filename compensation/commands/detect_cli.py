@@ -13,20 +13,20 @@ from thermostand.compensation.commands.options import (
     Incomplete,
     MegapixelsOption,
     TargetOption,
-    finding_markers,
-    installed_target,
-    said_if,
+    load_target_by_name,
+    make_warning_sink,
+    report_marker_search,
     say_left_out,
 )
-from thermostand.compensation.observations import read_frames, session_target
+from thermostand.compensation.observations import read_frames, read_session_target
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import check_writable
-from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, allow_images_up_to
 from thermostand.foundation.output import show
 from thermostand.foundation.progress import Report
-from thermostand.foundation.usage import one_line
-from thermostand.markers.detection import Detection, DetectionError, Image, detect, nothing_found
+from thermostand.foundation.usage import escape_line
+from thermostand.markers.detection import Detection, DetectionError, Image, detect, make_empty_detection
 from thermostand.markers.detections_table import CENTRES, DetectedImage, write_detections
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import Target
@@ -52,14 +52,14 @@ def detect_images(
 
     Example: compensate detect photos/*.png --target robot-cal-tools-10x10 -o markers.csv
     """
-    with images_up_to(max_megapixels):
+    with allow_images_up_to(max_megapixels):
         check_writable(out)
         opened = [_open(path, incomplete) for path in sources]
-        chosen = _detection_target(opened, target)
+        chosen = _select_target(opened, target)
         failures: list[str] = []
         doubtful: list[str] = []
-        with finding_markers(sum(_count(source) for source in opened), is_quick=True) as report:
-            write_detections(out, chosen, _detections(opened, chosen, failures, doubtful, report))
+        with report_marker_search(sum(_count(source) for source in opened), is_quick=True) as report:
+            write_detections(out, chosen, _detect_all(opened, chosen, failures, doubtful, report))
         shown = {"table": out, "target": chosen.name, "not_found": failures, "doubtful": doubtful}
         show(shown, [CENTRES, chosen.orientation])
         say_left_out("not found in", failures, doubtful)
@@ -68,27 +68,27 @@ def detect_images(
 def _open(path: Path, incomplete: bool) -> Session | Path:
     """A folder is a session, a file is an image."""
     if path.is_dir():
-        return open_whole(path, said_if(incomplete))
+        return open_whole(path, make_warning_sink(incomplete))
     if not path.exists():
         raise ConfigError(f"{path}: no such file or folder")
     return path
 
 
-def _detection_target(sources: Sequence[Session | Path], name: str | None) -> Target:
+def _select_target(sources: Sequence[Session | Path], name: str | None) -> Target:
     """The named target, else the one attached to all the sessions, else the paper's; one table has one target."""
     if name is not None:
-        return installed_target(name)
-    attached = [session_target(source) for source in sources if isinstance(source, Session)]
+        return load_target_by_name(name)
+    attached = [read_session_target(source) for source in sources if isinstance(source, Session)]
     if any(target != attached[0] for target in attached):
         raise ConfigError("the sessions have different targets; write a table for each")
-    return attached[0] if attached else installed_target(_DEFAULT_TARGET)
+    return attached[0] if attached else load_target_by_name(_DEFAULT_TARGET)
 
 
 def _count(source: Session | Path) -> int:
     return source.frame_count if isinstance(source, Session) else 1
 
 
-def _detections(
+def _detect_all(
     sources: Sequence[Session | Path], target: Target, failures: list[str], doubtful: list[str], report: Report
 ) -> Iterator[DetectedImage]:
     """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line;
@@ -100,7 +100,7 @@ def _detections(
     images = 0
     for source in sources:
         previous: Detection | None = None
-        for name, time_ns, image in _images(source, several):
+        for name, time_ns, image in _iterate_images(source, several):
             images += 1
             try:
                 # Photographs need not be of one pose: only frames of a session are tracked.
@@ -108,7 +108,7 @@ def _detections(
                 previous = found if isinstance(source, Session) else None
             except DetectionError as error:
                 failures.append(f"{name}: {error}")
-                found = nothing_found(target)
+                found = make_empty_detection(target)
             if found.is_doubtful:
                 doubtful.append(name)
             report(images, name)
@@ -122,11 +122,11 @@ def _report_part(report: Report, done: int, name: str, part: float) -> None:
     report(done + part, name)
 
 
-def _images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:
+def _iterate_images(source: Session | Path, several: bool) -> Iterator[tuple[str, int | None, Image]]:
     """Name (escaped), time and pixels of each image of a source."""
     if not isinstance(source, Session):
-        yield one_line(source.name), None, read_image(source)
+        yield escape_line(source.name), None, read_image(source)
         return
-    prefix = f"{one_line(source.path.name)}/" if several else ""
+    prefix = f"{escape_line(source.path.name)}/" if several else ""
     for index, frame in enumerate(read_frames(source)):
         yield f"{prefix}{index}", frame.time_ns, frame.image

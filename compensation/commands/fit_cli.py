@@ -8,49 +8,50 @@ from typing import Annotated
 
 import typer
 
-from thermostand.compensation.arrays import observations_of_table
-from thermostand.compensation.budget.budget import Budget, budget
-from thermostand.compensation.budget.budget import table as budget_table
+from thermostand.compensation.array_observations import load_observations
+from thermostand.compensation.budget.budget import Budget, compute_budget
+from thermostand.compensation.budget.budget import format_budget as budget_table
 from thermostand.compensation.budget.geometry import load_geometry
+from thermostand.compensation.camera_selection import select_camera
 from thermostand.compensation.commands.options import (
     CameraName,
     DetailsOption,
     Incomplete,
     MarkerSearch,
     TargetOption,
-    named_target,
+    load_optional_target,
     open_session,
 )
-from thermostand.compensation.datasheet.datasheet import datasheet
-from thermostand.compensation.datasheet.details import load_details
-from thermostand.compensation.drift.anchoring import anchored, fit_like, thermal_of
+from thermostand.compensation.datasheet.datasheet import compute_datasheet
+from thermostand.compensation.datasheet.measurement_details import load_details
 from thermostand.compensation.drift.bumps import Cause, find_unrepeated
-from thermostand.compensation.drift.choosing import Form, check_request
-from thermostand.compensation.drift.choosing import fit as fit_model
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.evaluation import Evaluation, evaluate, table
-from thermostand.compensation.drift.facts import Bump
+from thermostand.compensation.drift.evaluation import Evaluation, evaluate, format_table
+from thermostand.compensation.drift.model_facts import Bump
 from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.model_selection import Form, check_request
+from thermostand.compensation.drift.model_selection import fit as fit_model
 from thermostand.compensation.drift.paper_model import MAX_DEGREE
+from thermostand.compensation.drift.rereference import fit_like, get_thermal_form
+from thermostand.compensation.drift.rereference import rereference as rereference_model
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.observations import Observations, session_target
-from thermostand.compensation.one_camera import take
-from thermostand.compensation.reporting.drawing.figures import drawing
-from thermostand.compensation.reporting.equipment import equipment_of
-from thermostand.compensation.reporting.numbers import Extras, table_positions
-from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page, pdf_of
+from thermostand.compensation.observations import Observations, read_session_target
+from thermostand.compensation.reporting.drawing.figures import open_renderer
+from thermostand.compensation.reporting.equipment import list_equipment
+from thermostand.compensation.reporting.pages import render_datasheet_page, render_pdf, serialise_datasheet
 from thermostand.compensation.reporting.report import (
     NoModel,
     can_be_scored,
     check_report_writable,
-    fitted,
-    numbers_path,
+    fit_and_evaluate,
+    get_numbers_path,
     write_report,
 )
+from thermostand.compensation.reporting.report_numbers import Extras, list_table_positions
 from thermostand.compensation.validation3d.document import load_validation
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.files import check_writable, write_whole, write_whole_bytes
+from thermostand.foundation.files import check_writable, write_atomically, write_bytes_atomically
 from thermostand.foundation.output import say, show
 from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
@@ -72,20 +73,20 @@ def budget_of_session(
     """
     stand = load_geometry(geometry)
     recorded = open_session(session, camera, incomplete)
-    found = budget(recorded, named_target(target) or session_target(recorded), stand)
+    found = compute_budget(recorded, load_optional_target(target) or read_session_target(recorded), stand)
     show(found, [budget_table(found)])
 
 
-def budgets_of_sessions(
+def compute_budgets(
     paths: Sequence[Path], camera: str | None, geometry: str, target: Target | None
 ) -> dict[str, Budget]:
     """The budget of each session, by its name. SessionError or ConfigError with a sentence."""
     stand = load_geometry(geometry)
     opened = [Session.open(path) for path in paths]
     for session in opened:
-        take(session, camera)
+        select_camera(session, camera)
     return {
-        session.metadata.get("session_id", ""): budget(session, target or session_target(session), stand)
+        session.metadata.get("session_id", ""): compute_budget(session, target or read_session_target(session), stand)
         for session in opened
     }
 
@@ -114,14 +115,14 @@ def write_datasheet(
     stated = load_details(details)
     given = None if model is None else load_model(model)
     observations = finding.observed(sessions, camera)
-    sheet = datasheet(observations, given or fit_model(observations), stated)
-    equipment = equipment_of(Session.open(sessions[0]))
+    sheet = compute_datasheet(observations, given or fit_model(observations), stated)
+    equipment = list_equipment(Session.open(sessions[0]))
     if out.suffix.lower() == ".json":
-        write_whole(out, datasheet_json(sheet, equipment))
+        write_atomically(out, serialise_datasheet(sheet, equipment))
     elif out.suffix.lower() == ".pdf":
-        write_whole_bytes(out, pdf_of(datasheet_page(sheet, equipment)))
+        write_bytes_atomically(out, render_pdf(render_datasheet_page(sheet, equipment)))
     else:
-        write_whole(out, datasheet_page(sheet, equipment))
+        write_atomically(out, render_datasheet_page(sheet, equipment))
     known = sum(one.value == one.value for one in sheet.quantities)
     line = f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)"
     show({"file": out, "quantities": sheet.quantities}, [line])
@@ -172,24 +173,24 @@ def fit(
     check_writable(out)
     if like and (form == "paper" or degree is not None):
         raise ConfigError("--like fits the thermal form, which has no degree; leave out --form and --degree")
-    units = [thermal_of(load_model(path)) for path in like or ()]
+    units = [get_thermal_form(load_model(path)) for path in like or ()]
     if any(path.suffix.lower() == ".csv" for path in sessions):
-        observations = _of_table(sessions)
+        observations = _load_table(sessions)
     else:
         observations = finding.observed(sessions, camera)
     model = fit_like(observations, units) if units else fit_model(observations, degree, form, say)
-    evaluation, unscored = _scored(model, observations)
+    evaluation, unscored = _try_evaluate(model, observations)
     save_model(model, out)
     bumps = list(model.facts.bumps)
     unrepeated = find_unrepeated(observations, model.facts.bumps)
     named = [one for one in unrepeated if one.cause is not Cause.NOTHING]
     data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
-    stepped = [_bump_line(each, observations) for each in bumps]
+    stepped = [_format_bump(each, observations) for each in bumps]
     stepped += [f"{one.session_id}: {one.text}" for one in named]
     repeats = model.between_nights if isinstance(model, ThermalModel) else None
     stepped += [] if repeats is None else [repeats.text]
-    scored = f"what it gains is not known: {unscored}" if evaluation is None else table(evaluation)
-    scores = {"not_scored": unscored} if evaluation is None else _scores(evaluation)
+    scored = f"what it gains is not known: {unscored}" if evaluation is None else format_table(evaluation)
+    scores = {"not_scored": unscored} if evaluation is None else _describe_scores(evaluation)
     left_out = [f"{count} frames are left out: {reason}" for reason, count in observations.left_out.items()]
     lines = [f"{model.form}: {model.title}", *left_out, *stepped, scored]
     show({**data, "left_out": observations.left_out, "unrepeated": named, "between_nights": repeats, **scores}, lines)
@@ -212,13 +213,13 @@ def rereference(
     Example: compensate rereference model.json sessions/20260108T180000Z-short -o model-of-the-8th.json
     """
     check_writable(out)
-    known = thermal_of(load_model(model))
-    found = anchored(known, finding.observed([session], camera))
+    known = get_thermal_form(load_model(model))
+    found = rereference_model(known, finding.observed([session], camera))
     save_model(found, out)
     show({"model": out, "form": found.form, "title": found.title}, [f"{found.form}: {found.title}"])
 
 
-def _scored(model: DriftModel, observations: Observations) -> tuple[Evaluation | None, str]:
+def _try_evaluate(model: DriftModel, observations: Observations) -> tuple[Evaluation | None, str]:
     """What it gains, or None and why that cannot be told: the model stands without it."""
     try:
         return evaluate(model, observations), ""
@@ -226,13 +227,13 @@ def _scored(model: DriftModel, observations: Observations) -> tuple[Evaluation |
         return None, str(error)
 
 
-def _bump_line(bump: Bump, observations: Observations) -> str:
+def _format_bump(bump: Bump, observations: Observations) -> str:
     utc = next(facts.utc for facts in observations.sessions if facts.session_id == bump.session_id)
     when = f"{utc.date_time(bump.after_ns)} and {utc.date_time(bump.before_ns)}"
     return f"bump in {bump.session_id} between {when}: {bump.text}; fitted around it"
 
 
-def _scores(evaluation: Evaluation) -> dict[str, object]:
+def _describe_scores(evaluation: Evaluation) -> dict[str, object]:
     """What compensation gains, for programs; RMS along x and y, px."""
     return {
         "method": evaluation.method,
@@ -243,13 +244,13 @@ def _scores(evaluation: Evaluation) -> dict[str, object]:
     }
 
 
-def _of_table(paths: list[Path]) -> Observations:
+def _load_table(paths: list[Path]) -> Observations:
     if len(paths) > 1:
         raise ConfigError(f"{paths[1]}: a table of centres is fitted by itself; give one file, or sessions")
-    return observations_of_table(paths[0])
+    return load_observations(paths[0])
 
 
-def _extras(
+def _collect_extras(
     sessions: list[Path],
     camera: str | None,
     budget: str | None,
@@ -259,10 +260,10 @@ def _extras(
 ) -> Extras:
     return Extras(
         details=load_details(details),
-        budgets={} if budget is None else budgets_of_sessions(sessions, camera, budget, named_target(target)),
-        positions=table_positions([Session.open(path).steps() for path in sessions]),
+        budgets={} if budget is None else compute_budgets(sessions, camera, budget, load_optional_target(target)),
+        positions=list_table_positions([Session.open(path).steps() for path in sessions]),
         validation=None if validation is None else load_validation(validation),
-        equipment=equipment_of(Session.open(sessions[0])),
+        equipment=list_equipment(Session.open(sessions[0])),
     )
 
 
@@ -291,12 +292,12 @@ def report(
     check_report_writable(out, model, validation)
     given, extras = (
         model and load_model(model),
-        _extras(sessions, camera, budget, finding.target, validation, details),
+        _collect_extras(sessions, camera, budget, finding.target, validation, details),
     )
     observations = finding.observed(sessions, camera)
-    with drawing(finding.workers) as draw:
+    with open_renderer(finding.workers) as draw:
         if given is None:
-            used, evaluation, refusal = fitted(observations)
+            used, evaluation, refusal = fit_and_evaluate(observations)
         else:
             used, refusal = given, ""
             evaluation = evaluate(given, observations) if can_be_scored(observations) else None
@@ -305,6 +306,6 @@ def report(
         raise NoModel(f"no model: {refusal}; {out} shows the drift alone")
     alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
     alone = f"the model is not scored: {refusal}" if refusal else alone
-    scores = {} if evaluation is None else _scores(evaluation)
-    lines = [alone if evaluation is None else table(evaluation)]
-    show({"report": out, "numbers": numbers_path(out), **scores}, lines)
+    scores = {} if evaluation is None else _describe_scores(evaluation)
+    lines = [alone if evaluation is None else format_table(evaluation)]
+    show({"report": out, "numbers": get_numbers_path(out), **scores}, lines)

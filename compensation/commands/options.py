@@ -11,13 +11,13 @@ from typing import Annotated
 
 import typer
 
+from thermostand.compensation.camera_selection import select_camera
 from thermostand.compensation.finding.finder import finder
 from thermostand.compensation.observations import Observations, observe
-from thermostand.compensation.one_camera import take
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.output import say
-from thermostand.foundation.progress import Report, late_progress, progress
-from thermostand.markers.detections_table import doubt
+from thermostand.foundation.progress import Report, progress, show_late_progress
+from thermostand.markers.detections_table import format_noise_warning
 from thermostand.markers.target import Target, load_target
 from thermostand.recording.reading.session import Say, Session, open_whole
 
@@ -61,19 +61,19 @@ class MarkerSearch:
     def observed(self, sessions: Sequence[Path], camera: str | None) -> Observations:
         """The markers of the sessions. Raises as `observe`, and ConfigError for a target that is neither a file nor
         installed."""
-        wanted, found_by = named_target(self.target), finder(self.workers, self.cluster, use_cache=self.cache)
-        said = said_if(self.incomplete)
+        wanted, found_by = load_optional_target(self.target), finder(self.workers, self.cluster, use_cache=self.cache)
+        said = make_warning_sink(self.incomplete)
         return observe(sessions, progress, wanted, found_by, across_gap=self.across_gap, incomplete=said, camera=camera)
 
 
 def open_session(path: Path, camera: str | None, incomplete: bool) -> Session:
     """The session with the frames of one camera; raises as `open_whole` and `take`."""
-    session = open_whole(path, said_if(incomplete))
-    take(session, camera)
+    session = open_whole(path, make_warning_sink(incomplete))
+    select_camera(session, camera)
     return session
 
 
-def installed_target(name: str) -> Target:
+def load_target_by_name(name: str) -> Target:
     """The target of a file, or of an installed name; ConfigError that lists what there is."""
     if Path(name).is_file():
         return load_target(Path(name))
@@ -84,18 +84,18 @@ def installed_target(name: str) -> Target:
     return load_target(known[name.removesuffix(".yaml")])
 
 
-def named_target(name: str | None) -> Target | None:
+def load_optional_target(name: str | None) -> Target | None:
     """The target of an option, None when it was not given."""
-    return None if name is None else installed_target(name)
+    return None if name is None else load_target_by_name(name)
 
 
-def said_if(incomplete: bool) -> Say | None:
+def make_warning_sink(incomplete: bool) -> Say | None:
     """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
     return (lambda text: say(f"warning: {text}")) if incomplete else None
 
 
 @contextmanager
-def finding_markers(count: int, *, is_quick: bool = False) -> Generator[Report]:
+def report_marker_search(count: int, *, is_quick: bool = False) -> Generator[Report]:
     """Progress of a search in so many images; is_quick: shown only once it has taken a while. What has to be compiled
     first is said, and no part of the time left."""
     from thermostand.markers.compile_ahead import compile_ahead  # numba takes long to load
@@ -103,7 +103,7 @@ def finding_markers(count: int, *, is_quick: bool = False) -> Generator[Report]:
     compile_ahead(
         lambda: say("the search for markers is compiled for this machine, which takes a moment; the result is kept")
     )
-    with (late_progress if is_quick else progress)("find markers", count) as report:
+    with (show_late_progress if is_quick else progress)("find markers", count) as report:
         yield report
 
 
@@ -112,4 +112,4 @@ def say_left_out(what: str, failures: Sequence[str], doubtful: Sequence[str]) ->
     for failure in failures:
         say(f"{what} {failure}")
     if doubtful:
-        say(doubt(len(doubtful)))
+        say(format_noise_warning(len(doubtful)))

@@ -10,8 +10,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from thermostand.compensation.calibration.board import Board, board_of, board_of_corners
-from thermostand.compensation.calibration.calibrate import known_or_why
+from thermostand.compensation.calibration.board import Board, make_board, make_corner_board
+from thermostand.compensation.calibration.calibrate import try_check
 from thermostand.compensation.calibration.exports import EXPORTS, write_exports
 from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.pinhole import NAMES
@@ -22,14 +22,19 @@ from thermostand.compensation.calibration.views import (
     PointUncertainty,
     ViewCalibration,
     calibrate_views,
-    cross_validated_px,
-    known,
+    compute_point_uncertainty,
+    cross_validate_px,
 )
-from thermostand.compensation.commands.options import MegapixelsOption, finding_markers, installed_target, say_left_out
+from thermostand.compensation.commands.options import (
+    MegapixelsOption,
+    load_target_by_name,
+    report_marker_search,
+    say_left_out,
+)
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import CalibrationError, ConfigError
-from thermostand.foundation.files import check_folder_writable, make_folder, write_whole
-from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, images_up_to
+from thermostand.foundation.files import check_folder_writable, make_folder, write_atomically
+from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, allow_images_up_to
 from thermostand.foundation.output import show
 from thermostand.foundation.progress import Report
 from thermostand.markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
@@ -62,34 +67,40 @@ def calibrate_rig_command(
 
     Example: compensate calibrate-rig left right --target my-target.yaml --export rig
     """
-    with images_up_to(max_megapixels):
+    with allow_images_up_to(max_megapixels):
         if len(folders) < 2 or len({folder.name for folder in folders}) < len(folders):
             raise ConfigError("a rig has two or more cameras, each with a folder of another name")
         check_folder_writable(export, [RIG])
         for folder in folders:
             check_folder_writable(export / folder.name, EXPORTS)
-        board = described(target)
-        names = _moments(folders)
+        board = load_board(target)
+        names = _list_picture_names(folders)
         failures: list[str] = []
         doubtful: list[str] = []
-        with finding_markers(len(folders) * len(names)) as report:
+        with report_marker_search(len(folders) * len(names)) as report:
             seen = [
-                views_of(_pictures(folder, names), board, failures, doubtful, _after(report, number * len(names)))
+                collect_views(
+                    _list_pictures(folder, names),
+                    board,
+                    failures,
+                    doubtful,
+                    _offset_progress(report, number * len(names)),
+                )
                 for number, folder in enumerate(folders)
             ]
         say_left_out("not used:", failures, doubtful)
         useful = np.any([views.seen.any(axis=1) for views in seen], axis=0)
-        found = calibrate_rig([views.part(useful) for views in seen], known_board(board))
+        found = calibrate_rig([views.select(useful) for views in seen], make_prior_board(board))
         lines = [
             f"{np.count_nonzero(useful)} moments, {len(folders)} cameras",
-            *_lines(found, folders),
+            *_format_cameras(found, folders),
             board.orientation,
         ]
-        data = _written(found, folders, export)
+        data = _write_calibration(found, folders, export)
         show({"cameras": data, "not_used": failures, "doubtful": doubtful, "exports": export}, lines)
 
 
-def _moments(folders: list[Path]) -> list[str]:
+def _list_picture_names(folders: list[Path]) -> list[str]:
     """The names of the pictures, those of all folders together."""
     for folder in folders:
         if not folder.is_dir():
@@ -100,29 +111,29 @@ def _moments(folders: list[Path]) -> list[str]:
     return names
 
 
-def _after(report: Report, before: int) -> Report:
+def _offset_progress(report: Report, before: int) -> Report:
     def later(done: float, text: str) -> None:
         report(before + done, text)
 
     return later
 
 
-def _pictures(folder: Path, names: list[str]) -> list[tuple[Path | None, str]]:
+def _list_pictures(folder: Path, names: list[str]) -> list[tuple[Path | None, str]]:
     """Of each moment, None where the folder has none."""
     return [(folder / name if (folder / name).exists() else None, f"{folder.name}/{name}") for name in names]
 
 
-def _written(found: RigCalibration, folders: list[Path], export: Path) -> list[dict[str, object]]:
+def _write_calibration(found: RigCalibration, folders: list[Path], export: Path) -> list[dict[str, object]]:
     """Write rig.json and each camera's files; what rig.json says."""
-    data = _data(found, folders)
+    data = _describe_cameras(found, folders)
     make_folder(export)
     for number, folder in enumerate(folders):
         write_exports(export / folder.name, found.scene.lenses[number], folder.name, found.rms_px(number))
-    write_whole(export / RIG, json.dumps(data, indent=1) + "\n")
+    write_atomically(export / RIG, json.dumps(data, indent=1) + "\n")
     return data
 
 
-def _data(found: RigCalibration, folders: list[Path]) -> list[dict[str, object]]:
+def _describe_cameras(found: RigCalibration, folders: list[Path]) -> list[dict[str, object]]:
     """The cameras as rig.json has them."""
     rows: list[dict[str, object]] = []
     for number, folder in enumerate(folders):
@@ -131,34 +142,34 @@ def _data(found: RigCalibration, folders: list[Path]) -> list[dict[str, object]]
             "name": folder.name,
             "image_size": list(lens.image_size),
             "lens": dict(zip(NAMES, lens.vector.tolist(), strict=False)),
-            "lens_sigma": dict(zip(NAMES, found.lens_sigma(number).tolist(), strict=False)),
+            "lens_sigma": dict(zip(NAMES, found.compute_lens_sigma(number).tolist(), strict=False)),
             "rotation": found.scene.rotations[number].tolist(),
             "translation_mm": found.scene.translations_mm[number].tolist(),
             "rms_px": found.rms_px(number),
             "discrepancy_px": float(found.discrepancies_px[number]),
         }
         if number > 0:
-            turn_deg, shift_mm = found.pose_sigma(number)
+            turn_deg, shift_mm = found.compute_pose_sigma(number)
             row |= {"rotation_sigma_deg": turn_deg.tolist(), "translation_sigma_mm": shift_mm.tolist()}
         rows.append(row)
     return rows
 
 
-def _lines(found: RigCalibration, folders: list[Path]) -> list[str]:
+def _format_cameras(found: RigCalibration, folders: list[Path]) -> list[str]:
     lines: list[str] = []
     for number, folder in enumerate(folders):
         lens = found.scene.lenses[number]
         line = (
-            f"{folder.name}: fx {lens.vector[0]:.2f} +- {found.lens_sigma(number)[0]:.2g} px, residual "
+            f"{folder.name}: fx {lens.vector[0]:.2f} +- {found.compute_lens_sigma(number)[0]:.2g} px, residual "
             f"{1e3 * found.rms_px(number):.1f} mpx per coordinate, discrepancy "
             f"{1e3 * found.discrepancies_px[number]:.1f} mpx"
         )
         if number > 0:
-            length, sigma = found.baseline_mm(number)
+            length, sigma = found.compute_baseline_mm(number)
             turn_deg = float(np.degrees(np.arccos(np.clip((np.trace(found.scene.rotations[number]) - 1) / 2, -1, 1))))
             line += (
                 f"; {length:.3f} mm +- {2 * sigma:.2g} (k = 2) from {folders[0].name}, turned by {turn_deg:.3f} deg +- "
-                f"{2 * found.pose_sigma(number)[0].max():.2g} (k = 2)"
+                f"{2 * found.compute_pose_sigma(number)[0].max():.2g} (k = 2)"
             )
         lines.append(line)
     return lines
@@ -188,25 +199,25 @@ def calibrate_photographs(
 
     Example: compensate calibrate-photographs photos/*.jpg --target my-target.yaml --export exports
     """
-    with images_up_to(max_megapixels):
+    with allow_images_up_to(max_megapixels):
         for path in images:
             if not path.is_file():
                 raise ConfigError(
                     f"{path}: {'is a folder; give the pictures in it' if path.exists() else 'no such file'}"
                 )
         check_folder_writable(export, EXPORTS)
-        board = described(target)
+        board = load_board(target)
         failures: list[str] = []
         doubtful: list[str] = []
-        with finding_markers(len(images)) as report:
-            seen = views_of([(path, path.name) for path in images], board, failures, doubtful, report)
+        with report_marker_search(len(images)) as report:
+            seen = collect_views([(path, path.name) for path in images], board, failures, doubtful, report)
         say_left_out("not used:", failures, doubtful)
-        views, given = seen.part(np.asarray(seen.seen.any(axis=1))), known_board(board)
+        views, given = seen.select(np.asarray(seen.seen.any(axis=1))), make_prior_board(board)
         found = calibrate_views(views, given)
         at_mm = distance_mm or float(np.mean(found.scene.translations_mm[:, 2]))
-        held_out_px, unknown = known_or_why(lambda: cross_validated_px(views, given))
-        projection = known(found, at_mm)
-        lines = [summary(found, views, held_out_px, projection, board)]
+        held_out_px, unknown = try_check(lambda: cross_validate_px(views, given))
+        projection = compute_point_uncertainty(found, at_mm)
+        lines = [format_summary(found, views, held_out_px, projection, board)]
         if unknown:
             lines.append(f"how well pictures that were held out are met is not known: {unknown}")
         lens = dict(zip(NAMES, found.scene.lens.vector, strict=False))
@@ -217,7 +228,7 @@ def calibrate_photographs(
         show({**data, **checked, **more}, lines)
 
 
-def summary(
+def format_summary(
     found: ViewCalibration,
     views: Views,
     held_out_px: float | None,
@@ -248,18 +259,18 @@ def summary(
     return "\n".join(lines)
 
 
-def described(name: str) -> Target | BoardOfCorners:
+def load_board(name: str) -> Target | BoardOfCorners:
     """A board of squares or tags when the file says so, else a target of dots."""
     corners = load_corner_board(Path(name)) if Path(name).is_file() else None
-    return corners or installed_target(name)
+    return corners or load_target_by_name(name)
 
 
-def known_board(board: Target | BoardOfCorners) -> Board:
+def make_prior_board(board: Target | BoardOfCorners) -> Board:
     """What is known of it before a calibration."""
-    return board_of(board) if isinstance(board, Target) else board_of_corners(board)
+    return make_board(board) if isinstance(board, Target) else make_corner_board(board)
 
 
-def views_of(
+def collect_views(
     pictures: Sequence[tuple[Path | None, str]],
     board: Target | BoardOfCorners,
     failures: list[str],
@@ -280,7 +291,7 @@ def views_of(
             continue
         try:
             pixels = read_image(path)
-            found, covariance, is_doubtful = _look(pixels, board)
+            found, covariance, is_doubtful = _measure_points(pixels, board)
         except DetectionError as error:
             failures.append(f"{name}: {str(error).removeprefix(f'{path}: ')}")
             continue
@@ -301,7 +312,7 @@ def views_of(
     return Views(centres, covariances, size)
 
 
-def _look(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
+def _measure_points(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
     """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are doubtful; DetectionError
     when the target is not in it."""
     if isinstance(target, Target):

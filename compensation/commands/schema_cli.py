@@ -11,12 +11,12 @@ import typer
 from pydantic import BaseModel
 
 from thermostand.compensation.budget.geometry import Geometry
-from thermostand.compensation.datasheet.details import Details
+from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
 from thermostand.foundation.command_app import App
 from thermostand.foundation.documents import write_schemas
 from thermostand.foundation.output import show
 
-DOCUMENTS: Mapping[str, type[BaseModel]] = {"geometry": Geometry, "details": Details}
+DOCUMENTS: Mapping[str, type[BaseModel]] = {"geometry": Geometry, "details": MeasurementDetails}
 
 app = App()
 

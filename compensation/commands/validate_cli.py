@@ -10,24 +10,24 @@ import typer
 
 from thermostand.compensation.budget.geometry import load_geometry
 from thermostand.compensation.calibration.camera_file import load_camera
+from thermostand.compensation.camera_selection import find_camera_name
 from thermostand.compensation.commands.options import MarkerSearch
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.observations import Float
-from thermostand.compensation.one_camera import name_of
-from thermostand.compensation.reporting.pages import validation_page
-from thermostand.compensation.validation3d.document import as_json, summary
+from thermostand.compensation.reporting.pages import render_validation_page
+from thermostand.compensation.validation3d.document import format_summary, serialise_validation
 from thermostand.compensation.validation3d.validate import (
     LensModel,
-    StandPart,
-    camera_of,
+    StandContribution,
     check_same,
-    stand_part,
+    compute_stand_contribution,
+    select_lens_model,
+    select_validation_frames,
     validate,
-    validation_frames,
 )
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.files import check_writable, write_whole
+from thermostand.foundation.files import check_writable, write_atomically
 from thermostand.foundation.output import say, show
 from thermostand.recording.reading.session import Session
 
@@ -56,33 +56,33 @@ def validate_session(
     Example: compensate validate sessions/20260101T180000Z-validation --camera camera.json --model model.json
     -o validation.html
     """
-    beside = _numbers_beside(out)
+    numbers_path = _choose_numbers_path(out)
     file, drift = load_camera(camera), load_model(model)
-    calibrated = camera_of(file, lens)
+    calibrated = select_lens_model(file, lens)
     if lens is LensModel.RAYS and file.rays_doubt:
         say(file.rays_doubt)
     geometry = None if budget is None else load_geometry(budget)
     opened = Session.open(session)
-    observations = finding.observed([session], name_of(opened, file.camera_serial))
+    observations = finding.observed([session], find_camera_name(opened, file.camera_serial))
     check_same(observations, file, drift)
-    frames = validation_frames(opened, observations)
+    frames = select_validation_frames(opened, observations)
 
-    def stand_at(distances_mm: Float) -> StandPart | None:
+    def stand_at(distances_mm: Float) -> StandContribution | None:
         if geometry is None:
             return None
-        return stand_part(opened, observations, frames, geometry, distances_mm)
+        return compute_stand_contribution(opened, observations, frames, geometry, distances_mm)
 
     found = validate(observations, frames, calibrated, drift, stand_at)
-    write_whole(out, validation_page(found))
-    write_whole(beside, as_json(found))
-    show(json.loads(as_json(found)), [summary(found)])
+    write_atomically(out, render_validation_page(found))
+    write_atomically(numbers_path, serialise_validation(found))
+    show(json.loads(serialise_validation(found)), [format_summary(found)])
 
 
-def _numbers_beside(page: Path) -> Path:
+def _choose_numbers_path(page: Path) -> Path:
     """Where the numbers go; ConfigError when that is the page, or one of the two cannot be written."""
-    beside = page.with_suffix(".json")
-    if beside == page:
+    numbers_path = page.with_suffix(".json")
+    if numbers_path == page:
         raise ConfigError(f"{page}: the page is HTML, and a JSON file is written beside it; name it .html")
-    for path in (page, beside):
+    for path in (page, numbers_path):
         check_writable(path)
-    return beside
+    return numbers_path

@@ -10,13 +10,13 @@ from typing import Literal
 
 import numpy as np
 
-from thermostand.compensation.datasheet.details import Details
-from thermostand.compensation.drift.bumps import around_bumps
-from thermostand.compensation.drift.choosing import FORMS
-from thermostand.compensation.drift.displacements import reference_centres
+from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
+from thermostand.compensation.drift.bumps import correct_bumps
+from thermostand.compensation.drift.displacements import average_reference_centres
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
-from thermostand.compensation.drift.hysteresis import Hysteresis, hysteresis
+from thermostand.compensation.drift.hysteresis import Hysteresis, compute_hysteresis
+from thermostand.compensation.drift.model_selection import FORMS
 from thermostand.compensation.observations import Float, Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
@@ -26,7 +26,7 @@ from thermostand.foundation.errors import SessionError
 
 COVERAGE = 2.0
 """Expanded uncertainties are this many standard ones: about 95 % of a normal distribution."""
-NIGHTS = "night to night"
+BETWEEN_SESSIONS = "night to night"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class MeasuredQuantity:
         return COVERAGE * self.u
 
 
-def pooled(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
+def pool_sessions(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
     """The mean of the same quantity over nights. What each night's statistics say shrinks with their number, what is of
     type B is common to all; how they differ is a contribution of its own."""
     known = [one for one in nights if not math.isnan(one.value)]
@@ -95,7 +95,7 @@ def pooled(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
         lines.append(replace(same[0], u=amount / abs(sensitivity), sensitivity=sensitivity))
     spread = float(np.std(values, ddof=1)) / math.sqrt(count)
     basis = f"standard deviation of the mean of {count} nights"
-    lines.append(Contribution(NIGHTS, "A", spread, known[0].unit, basis))
+    lines.append(Contribution(BETWEEN_SESSIONS, "A", spread, known[0].unit, basis))
     return replace(known[0], value=float(np.mean(values)), contributions=tuple(lines))
 
 
@@ -131,13 +131,13 @@ class Warming:
     moved: Float
 
 
-def motions(observations: Observations) -> Float:
+def fit_motions(observations: Observations) -> Float:
     """(F, 4): of every usable frame from its session's reference, NaN elsewhere. Least squares of a similarity about
     the image's middle: dx = a + s x - r y, dy = b + s y + r x."""
     found = np.full((len(observations.frame), 4), np.nan)
     width, height = observations.image_size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    reference = reference_centres(observations)[0]
+    reference = average_reference_centres(observations)[0]
     for frame in np.flatnonzero(observations.usable):
         start = reference[observations.session[frame]]
         moved = observations.centres_px[frame] - start
@@ -152,7 +152,7 @@ def motions(observations: Observations) -> Float:
     return found
 
 
-def visits_of(observations: Observations, moved: Float, session: int) -> Visits:
+def collect_visits(observations: Observations, moved: Float, session: int) -> Visits:
     """Frames of one set-point that follow each other are a visit; those without air or markers do not count."""
     own = observations.of(*SET_POINTS) & (observations.session == session) & np.isfinite(moved[:, 0])
     own &= np.isfinite(observations.air_degC)
@@ -165,7 +165,7 @@ def visits_of(observations: Observations, moved: Float, session: int) -> Visits:
     return Visits(table[:, 0], table[:, 1], table[:, 2], table[:, 3:])
 
 
-def warming_of(observations: Observations, moved: Float, session: int) -> Warming | None:
+def find_warm_up(observations: Observations, moved: Float, session: int) -> Warming | None:
     """The session's first warm-up; None without one at the reference's place."""
     own: Mask = observations.of(Role.WARM_UP) & (observations.session == session) & np.isfinite(moved[:, 0])
     frames = np.flatnonzero(own)
@@ -176,7 +176,7 @@ def warming_of(observations: Observations, moved: Float, session: int) -> Warmin
     if len(frames) < 5 or np.abs(moved[frames, :2]).max() > 10:
         return None
     times_ns = observations.time_ns[frames]
-    on_ns = observations.switched_on_ns(session, int(times_ns[0]))
+    on_ns = observations.find_switch_on_ns(session, int(times_ns[0]))
     since_s = (times_ns - (int(times_ns[0]) if on_ns is None else on_ns)) / 1e9
     return Warming(
         since_s,
@@ -190,7 +190,7 @@ def warming_of(observations: Observations, moved: Float, session: int) -> Warmin
 _FEWEST = 3
 
 
-def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[MeasuredQuantity]:
+def compute_hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[MeasuredQuantity]:
     """RMS of heating minus cooling over set-points reached from both sides, mpx. scatter_px: what does not repeat."""
     group, title = "Dependence on the way", "Heating against cooling"
     model = "root mean square of (heating − cooling) over set-points reached from both sides, mean over the markers"
@@ -206,15 +206,21 @@ def hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float])
         noise = 1e3 * float(np.sqrt(np.mean([gap.uncertainty_px[axis] ** 2 for gap in gaps])))
         repeats = 1e3 * scatter_px[axis] * math.sqrt(2 / len(differences))
         quantities[axis] = one.found(
-            _rms(differences),
-            Contribution("choice of set-points", "A", _jackknife(differences, _rms), "mpx", "each left out once"),
+            _compute_rms(differences),
+            Contribution(
+                "choice of set-points",
+                "A",
+                _jackknife_uncertainty(differences, _compute_rms),
+                "mpx",
+                "each left out once",
+            ),
             Contribution("noise of the markers", "A", noise / math.sqrt(len(gaps)), "mpx", "as the marker fit claims"),
-            Contribution("what does not repeat", "A", repeats, "mpx", UNREPEATED),
+            Contribution("what does not repeat", "A", repeats, "mpx", NOT_REPEATING),
         )
     return quantities
 
 
-def residual_quantities(
+def compute_residual_quantities(
     form: str, evaluation: Evaluation | None, scatter_px: Sequence[float]
 ) -> Iterator[MeasuredQuantity]:
     """RMS along I and J at held-out set-points, mpx; the marker's noise of single frames is in it."""
@@ -235,16 +241,18 @@ def residual_quantities(
         repeats = math.sqrt(value**2 + (1e3 * scatter_px[axis]) ** 2 / len(each)) - value
         yield one.found(
             value,
-            Contribution("choice of set-points", "A", _jackknife(each, _rms), "mpx", "each left out once"),
-            Contribution("what does not repeat", "A", repeats, "mpx", UNREPEATED),
+            Contribution(
+                "choice of set-points", "A", _jackknife_uncertainty(each, _compute_rms), "mpx", "each left out once"
+            ),
+            Contribution("what does not repeat", "A", repeats, "mpx", NOT_REPEATING),
         )
 
 
-def _rms(values: Float) -> float:
+def _compute_rms(values: Float) -> float:
     return math.sqrt(float(np.mean(values**2)))
 
 
-def _jackknife(values: Float, statistic: Callable[[Float], float]) -> float:
+def _jackknife_uncertainty(values: Float, statistic: Callable[[Float], float]) -> float:
     """Standard uncertainty of a statistic of independent values."""
     count = len(values)
     without = np.array([statistic(np.delete(values, k)) for k in range(count)])
@@ -276,7 +284,7 @@ class Curve:
     span_K: float
 
 
-def curve(visits: Visits, motion: int) -> Curve | None:
+def fit_curve(visits: Visits, motion: int) -> Curve | None:
     """None when there are too few visits to say how they scatter."""
     count = len(visits.air_degC)
     if count < _FEWEST_VISITS or len(np.unique(visits.chamber_degC)) < 4:
@@ -299,10 +307,10 @@ def curve(visits: Visits, motion: int) -> Curve | None:
     return Curve(float(found[1]), u_slope, float(found[4]) if both else 0.0, scatter, float(np.ptp(visits.air_degC)))
 
 
-def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Iterator[MeasuredQuantity]:
+def compute_coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Iterator[MeasuredQuantity]:
     """Of the four motions."""
     for motion, (key, name, unit) in enumerate(zip(MOTIONS, NAMES, UNITS, strict=True)):
-        fitted, per_K = curve(visits, motion), f"{unit}/K"
+        fitted, per_K = fit_curve(visits, motion), f"{unit}/K"
         one = MeasuredQuantity(f"{key}_per_K", _GROUP, name, per_K, _MODEL, why=_TOO_FEW)
         if fitted is None:
             yield one
@@ -321,7 +329,7 @@ def coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Ite
         yield one.found(fitted.slope, *lines)
 
 
-UNREPEATED = "what the chosen form leaves unexplained"
+NOT_REPEATING = "what the chosen form leaves unexplained"
 _SWITCHING_ON = "Switching on"
 _NAMES = ("Drift in the warm-up, I", "Drift in the warm-up, J", "Change of scale in the warm-up")
 _SETTLED = 0.9  # the usual 90 % of a settling time
@@ -333,47 +341,47 @@ _NO_CURVE = "no temperature coefficient to compare with"
 _OF_PLACE = "thermometer and its place"
 
 
-def warming_quantities(
+def compute_warm_up_quantities(
     warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float
 ) -> list[MeasuredQuantity]:
     """All of them; NaN with a reason where nothing was recorded. scatter: of MOTIONS, what does not repeat."""
-    share = _share(warming, visits, scatter, u_air_K)
+    share = _compute_camera_share(warming, visits, scatter, u_air_K)
     return [
-        *_drifts(warming, scatter, u_air_K),
-        _settling(warming, scatter),
-        _rate(warming, scatter),
-        _self_heating(visits, u_air_K),
+        *_compute_drifts(warming, scatter, u_air_K),
+        _compute_settling(warming, scatter),
+        _compute_final_rate(warming, scatter),
+        _compute_self_heating(visits, u_air_K),
         share,
-        _rest(share),
+        _compute_surroundings_share(share),
     ]
 
 
-def _switching_on(key: str, name: str, unit: str, model: str = "", why: str = _NO_WARM_UP) -> MeasuredQuantity:
+def _make_unknown_quantity(key: str, name: str, unit: str, model: str = "", why: str = _NO_WARM_UP) -> MeasuredQuantity:
     """Not known yet, and why that may stay so."""
     return MeasuredQuantity(key, _SWITCHING_ON, name, unit, model, why=why)
 
 
-def _drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> Iterator[MeasuredQuantity]:
+def _compute_drifts(warming: Warming | None, scatter: Sequence[float], u_air_K: float) -> Iterator[MeasuredQuantity]:
     for motion, name in enumerate(_NAMES):
         key, unit = f"warm_up_{MOTIONS[motion]}", UNITS[motion]
         if warming is None:
-            yield _switching_on(key, name, unit)
+            yield _make_unknown_quantity(key, name, unit)
             continue
         value = float(warming.moved[-1, motion])
         minutes = warming.since_s[[0, -1]] / 60
         risen_K = max(float(warming.camera_degC[-1] - warming.camera_degC[0]), 1.0)
-        noise = math.sqrt(2) * frame_noise(warming.since_s, warming.moved[:, motion])
+        noise = math.sqrt(2) * estimate_frame_noise(warming.since_s, warming.moved[:, motion])
         model = f"y at {minutes[1]:z.1f} min minus y at {minutes[0]:z.1f} min"
         model += " after switching on" if warming.known else " of the recording"
-        yield _switching_on(key, name, unit, model).found(
+        yield _make_unknown_quantity(key, name, unit, model).found(
             value,
-            Contribution("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, UNREPEATED),
+            Contribution("what does not repeat", "A", math.sqrt(2) * scatter[motion], unit, NOT_REPEATING),
             Contribution("noise of the frames", "A", noise, unit, _OF_RESIDUALS),
             Contribution("temperature it began at", "B", u_air_K, "K", _OF_PLACE, value / risen_K),
         )
 
 
-def frame_noise(since_s: Float, values: Float) -> float:
+def estimate_frame_noise(since_s: Float, values: Float) -> float:
     """Standard deviation of one frame about the drift: of the residuals of a line and exponentials, by least squares.
 
     since_s, values (F,), F >= 5. A warm-up is a sum of exponentials, so that no drift is left in the residuals,
@@ -393,41 +401,41 @@ def frame_noise(since_s: Float, values: Float) -> float:
     return math.sqrt(float(left @ left) / (count - int(rank)))
 
 
-def _settling(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
+def _compute_settling(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
     model = f"first time after which the drift along its direction stays above {_SETTLED:.0%} of its last value"
-    one = _switching_on("settling_s", "Time to 90 % of the drift in the recorded warm-up", "s", model)
+    one = _make_unknown_quantity("settling_s", "Time to 90 % of the drift in the recorded warm-up", "s", model)
     if warming is None:
         return replace(one, model="")
     whole = warming.moved[-1, :2]
     size = float(np.linalg.norm(whole))
     along = warming.moved[:, :2] @ whole / max(size, 1e-12)
-    noise = math.sqrt(2) * frame_noise(warming.since_s, along)
+    noise = math.sqrt(2) * estimate_frame_noise(warming.since_s, along)
     if size < 10 * noise:
         return replace(one, why="the warm-up moves the image by no more than noise")
     below = int(np.flatnonzero(along < _SETTLED * size)[-1])
     after = min(below + 1, len(along) - 1)
     step_s, step_px = warming.since_s[after] - warming.since_s[below], along[after] - along[below]
     value = float(warming.since_s[below] + step_s * (_SETTLED * size - along[below]) / max(float(step_px), 1e-12))
-    rate = max(_slope(warming.since_s, along, value), 1e-9)
+    rate = max(_fit_slope(warming.since_s, along, value), 1e-9)
     repeats = float(np.hypot(scatter[0], scatter[1]))
     return one.found(
         value,
         Contribution("drift at that time", "A", noise, "px", _OF_RESIDUALS, 1 / rate),
-        Contribution("what does not repeat", "A", repeats, "px", UNREPEATED, 1 / rate),
+        Contribution("what does not repeat", "A", repeats, "px", NOT_REPEATING, 1 / rate),
         Contribution("instant of switching on", "B", 0.5, "s", "a second between commands and readings"),
     )
 
 
-def _slope(at_s: Float, values: Float, middle_s: float) -> float:
+def _fit_slope(at_s: Float, values: Float, middle_s: float) -> float:
     near = np.abs(at_s - middle_s) <= _LAST_S
     if near.sum() < 3:
         return 0.0
     return abs(float(np.polyfit(at_s[near] - middle_s, values[near], 1)[0]))
 
 
-def _rate(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
+def _compute_final_rate(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity:
     unit = "mpx/min"
-    one = _switching_on("rate_at_end", "Drift still going on at the end of the warm-up", unit)
+    one = _make_unknown_quantity("rate_at_end", "Drift still going on at the end of the warm-up", unit)
     if warming is None:
         return one
     last = warming.since_s >= warming.since_s[-1] - _LAST_S
@@ -449,9 +457,9 @@ def _rate(warming: Warming | None, scatter: Sequence[float]) -> MeasuredQuantity
     )
 
 
-def _self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
+def _compute_self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
     model, why = "camera's own sensor minus the air near it, at the reference", "no air temperature near the camera"
-    one = _switching_on("self_heating_K", "Self-heating, by its own sensor", "K", model, why)
+    one = _make_unknown_quantity("self_heating_K", "Self-heating, by its own sensor", "K", model, why)
     excess = visits.camera_degC - visits.air_degC
     if not len(excess):
         return one
@@ -463,7 +471,9 @@ def _self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
     )
 
 
-def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float) -> MeasuredQuantity:
+def _compute_camera_share(
+    warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float
+) -> MeasuredQuantity:
     """Of the shift per K of the air, how much the camera's own warming moves the image per K of its own sensor. The
     rest follows the surroundings: mount, fixture, and what of the camera stays at the air's temperature then."""
     model = (
@@ -471,8 +481,8 @@ def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_
         "follows mount and surroundings, which are taken to stay at the air's temperature in the warm-up; above 100 % "
         "they move the image back"
     )
-    one = _switching_on("camera_share", "Part of the shift that follows the camera itself", "%", model)
-    fitted = [curve(visits, axis) for axis in (0, 1)]
+    one = _make_unknown_quantity("camera_share", "Part of the shift that follows the camera itself", "%", model)
+    fitted = [fit_curve(visits, axis) for axis in (0, 1)]
     if warming is None:
         return one
     if fitted[0] is None or fitted[1] is None:
@@ -489,14 +499,14 @@ def _share(warming: Warming | None, visits: Visits, scatter: Sequence[float], u_
     drift, by_drift = math.sqrt(2) * max(scatter[:2]), 100 / (risen_K * math.sqrt(size))
     return one.found(
         100 * share,
-        Contribution("drift in the warm-up", "A", drift, "px", UNREPEATED, by_drift),
+        Contribution("drift in the warm-up", "A", drift, "px", NOT_REPEATING, by_drift),
         Contribution("coefficient along I", "A", u_slope[0], "px/K", "as above", by_slope[0]),
         Contribution("coefficient along J", "A", u_slope[1], "px/K", "as above", by_slope[1]),
         Contribution("warming of the camera", "B", u_air_K, "K", "of its own sensor", 100 * share / risen_K),
     )
 
 
-def _rest(share: MeasuredQuantity) -> MeasuredQuantity:
+def _compute_surroundings_share(share: MeasuredQuantity) -> MeasuredQuantity:
     """What the camera's share leaves, as uncertain as that."""
     lines = tuple(replace(line, sensitivity=-line.sensitivity) for line in share.contributions)
     name, model = "Part of the shift that follows mount and surroundings", "100 % less the part that follows the camera"
@@ -509,7 +519,7 @@ class Datasheet:
     air_degC, camera_degC: range of the visits. model: in use."""
 
     observations: Observations
-    details: Details
+    details: MeasurementDetails
     model: DriftModel
     quantities: tuple[MeasuredQuantity, ...]
     nights: tuple[tuple[MeasuredQuantity, ...], ...]
@@ -524,36 +534,38 @@ class Datasheet:
         return {one.key: one for one in self.quantities}
 
 
-def datasheet(observations: Observations, model: DriftModel, details: Details | None = None) -> Datasheet:
+def compute_datasheet(
+    observations: Observations, model: DriftModel, details: MeasurementDetails | None = None
+) -> Datasheet:
     """SessionError when no session has a reference and set-points."""
-    details = details or Details()
-    steady = around_bumps(observations, model.facts.bumps)
-    moved = motions(steady)
-    of_session = {one.session_id: one for one in hysteresis(steady)}
-    evaluations = _evaluations(model, observations)
+    details = details or MeasurementDetails()
+    steady = correct_bumps(observations, model.facts.bumps)
+    moved = fit_motions(steady)
+    of_session = {one.session_id: one for one in compute_hysteresis(steady)}
+    evaluations = _evaluate_forms(model, observations)
     nights: list[tuple[MeasuredQuantity, ...]] = []
     visits: list[Visits] = []
     warmings: list[Warming | None] = []
     for index, facts in enumerate(observations.sessions):
-        own = visits_of(steady, moved, index)
+        own = collect_visits(steady, moved, index)
         if not len(own.air_degC):
             continue
-        scatter = _unrepeated(own, model)
+        scatter = _estimate_unrepeated(own, model)
         visits.append(own)
-        warmings.append(warming_of(steady, moved, index))
+        warmings.append(find_warm_up(steady, moved, index))
         nights.append(
             (
-                *coefficients(own, details.u_air_K, details.u_target_ppm_per_K),
-                *warming_quantities(warmings[-1], own, scatter, details.u_air_K),
-                *hysteresis_quantities(of_session.get(facts.session_id), scatter),
+                *compute_coefficients(own, details.u_air_K, details.u_target_ppm_per_K),
+                *compute_warm_up_quantities(warmings[-1], own, scatter, details.u_air_K),
+                *compute_hysteresis_quantities(of_session.get(facts.session_id), scatter),
             )
         )
     if not nights:
         raise SessionError("no session has frames at set-points with a known air temperature; there is no datasheet")
-    of_nights = [pooled(same) for same in zip(*nights, strict=True)]
-    scatter = _unrepeated(visits[0], model)
-    left = [one for form in FORMS for one in residual_quantities(form, evaluations.get(form), scatter)]
-    whole = _joined(visits)
+    of_nights = [pool_sessions(same) for same in zip(*nights, strict=True)]
+    scatter = _estimate_unrepeated(visits[0], model)
+    left = [one for form in FORMS for one in compute_residual_quantities(form, evaluations.get(form), scatter)]
+    whole = _concatenate_visits(visits)
     return Datasheet(
         observations=observations,
         details=details,
@@ -567,21 +579,21 @@ def datasheet(observations: Observations, model: DriftModel, details: Details | 
     )
 
 
-def _joined(visits: list[Visits]) -> Visits:
+def _concatenate_visits(visits: list[Visits]) -> Visits:
     names = ("air_degC", "camera_degC", "chamber_degC", "moved")
     return replace(visits[0], **{name: np.concatenate([getattr(one, name) for one in visits]) for name in names})
 
 
-def _unrepeated(visits: Visits, model: DriftModel) -> tuple[float, ...]:
+def _estimate_unrepeated(visits: Visits, model: DriftModel) -> tuple[float, ...]:
     """One standard deviation of each of MOTIONS that temperature and its history do not explain: what the chosen form
     leaves, and no more than the visits scatter about a curve."""
     i, j = model.discrepancy_px.tolist()
     angle = 1e6 * max(i, j) / (model.facts.image_size[0] / 2)
-    scatters = [fitted.scatter if (fitted := curve(visits, motion)) else np.inf for motion in range(len(MOTIONS))]
+    scatters = [fitted.scatter if (fitted := fit_curve(visits, motion)) else np.inf for motion in range(len(MOTIONS))]
     return tuple(min(pair) for pair in zip((i, j, angle, angle), scatters, strict=True))
 
 
-def _evaluations(model: DriftModel, observations: Observations) -> dict[str, Evaluation]:
+def _evaluate_forms(model: DriftModel, observations: Observations) -> dict[str, Evaluation]:
     found: dict[str, Evaluation] = {}
     for one in (model, model.other):
         if one is None:

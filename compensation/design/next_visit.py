@@ -22,18 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.drift.candidates import FEWEST_BETWEEN
-from thermostand.compensation.drift.terms import features
-from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.terms import compute_features
+from thermostand.compensation.drift.thermal_fit import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift_runtime import Follower
 from thermostand.compensation.expression import AIR, POWER, lag
 from thermostand.compensation.history.thermal_history import (
     Float,
     States,
-    ThermalMemory,
-    damped_least_squares,
-    recorded_history,
-    states_at,
+    ThermalStateSpec,
+    compute_states_at,
+    read_history,
+    solve_damped_least_squares,
 )
 from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import WANTED_STATES, Role, WantedState
@@ -94,29 +94,29 @@ class ForecastState:
         )
 
 
-def together(parts: Sequence[ForecastState]) -> ForecastState:
+def concatenate_states(parts: Sequence[ForecastState]) -> ForecastState:
     """The situations of all these, which remember the same; ValueError for none."""
     columns = [(part.target_degC, part.air_degC, part.camera_lags, part.states.rows) for part in parts]
     target, air, lags, rows = (np.concatenate(each) for each in zip(*columns, strict=True))
     return ForecastState(target, air, lags, States(parts[0].states.memory, rows))
 
 
-def surroundings(observations: Observations, ramp_K_per_min: float) -> CameraSurroundings:
+def fit_surroundings(observations: Observations, ramp_K_per_min: float) -> CameraSurroundings:
     """What the last session says; SessionError when it has no history of the air or too few readings of the camera."""
     history = observations.histories[-1] if observations.histories else None
     if history is None or not history.has_ambient or len(history.camera_ns) < 10 * _EVERY_READING:
         raise SessionError("the session has no history of air and camera; nothing can be foreseen")
     at_ns, recorded_degC = history.camera_ns[::_EVERY_READING], history.camera_degC[::_EVERY_READING]
-    states = states_at(history, ThermalMemory((*_AIR_LAGS, *_POWER_LAGS)), at_ns, recorded_degC)
+    states = compute_states_at(history, ThermalStateSpec((*_AIR_LAGS, *_POWER_LAGS)), at_ns, recorded_degC)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
     # While it warms up the supply's lags explain it; of a camera that has been on for long they are 1.
     terms = np.column_stack([np.ones(len(air)), air, states.of(_AIR_LAGS), states.of(_POWER_LAGS) - 1])
     known = np.isfinite(terms).all(axis=1) & np.isfinite(recorded_degC)
-    weights = damped_least_squares(terms[known], recorded_degC[known], _RIDGE)
-    return CameraSurroundings(_air(observations), weights[: 2 + len(_AIR_LAGS)], ramp_K_per_min)
+    weights = solve_damped_least_squares(terms[known], recorded_degC[known], _RIDGE)
+    return CameraSurroundings(_fit_air_response(observations), weights[: 2 + len(_AIR_LAGS)], ramp_K_per_min)
 
 
-def _air(observations: Observations) -> Float:
+def _fit_air_response(observations: Observations) -> Float:
     """Offset and slope; the air is taken to be at the set-point until two of them have been visited."""
     frames = observations.of(Role.REFERENCE, Role.FIT, Role.VALIDATION) & np.isfinite(observations.air_degC)
     set_points, air = observations.chamber_degC[frames], observations.air_degC[frames]
@@ -127,17 +127,17 @@ def _air(observations: Observations) -> Float:
     return np.array([offset, slope]) if 0.5 < slope < 1.5 else np.array([0.0, 1.0])
 
 
-def now(observations: Observations, memory: ThermalMemory) -> ForecastState:
+def read_current_state(observations: Observations, memory: ThermalStateSpec) -> ForecastState:
     """At the last frame of the last session."""
     history = observations.histories[-1]
     own = observations.session == len(observations.sessions) - 1
     at_ns, recorded_degC = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
-    lags = states_at(history, ThermalMemory(tuple(_AIR_LAGS)), at_ns, recorded_degC).of(_AIR_LAGS)
+    lags = compute_states_at(history, ThermalStateSpec(tuple(_AIR_LAGS)), at_ns, recorded_degC).of(_AIR_LAGS)
     air = np.interp(at_ns, history.ambient_ns, history.ambient_degC)
-    return ForecastState(air, air, lags, states_at(history, memory, at_ns, recorded_degC))
+    return ForecastState(air, air, lags, compute_states_at(history, memory, at_ns, recorded_degC))
 
 
-def at_rest(around: CameraSurroundings, set_points_degC: Float, memory: ThermalMemory) -> ForecastState:
+def compute_equilibrium(around: CameraSurroundings, set_points_degC: Float, memory: ThermalStateSpec) -> ForecastState:
     """Of a powered camera after a long time at set-points (S,); plays are as after a way from a colder place."""
     air = around.air_degC(set_points_degC)
     lags = np.repeat(air[:, None], len(_AIR_LAGS), axis=1)
@@ -145,15 +145,17 @@ def at_rest(around: CameraSurroundings, set_points_degC: Float, memory: ThermalM
     values = follower.rest([around.camera_degC(air, lags), air, np.ones(len(air))])
     for place, _, is_play, radius_K in follower.parts:
         values[place] = values[place] - (radius_K if is_play else 0.0)
-    return ForecastState(air, air, lags, _states(memory, values))
+    return ForecastState(air, air, lags, _make_states(memory, values))
 
 
-def _states(memory: ThermalMemory, values: Sequence[Float]) -> States:
+def _make_states(memory: ThermalStateSpec, values: Sequence[Float]) -> States:
     """Of a camera that has been on, and followed, for long."""
     return States(memory, np.column_stack([*values, *np.full((2, len(values[0])), np.inf)]))
 
 
-def after(around: CameraSurroundings, situation: ForecastState, set_points_degC: Float, soak_s: Float) -> ForecastState:
+def forecast(
+    around: CameraSurroundings, situation: ForecastState, set_points_degC: Float, soak_s: Float
+) -> ForecastState:
     """After dwells (S,) at set-points (S,), s and degC."""
     goal, memory = around.air_degC(set_points_degC), situation.states.memory
     left_s = np.asarray(soak_s, np.float64).copy()
@@ -170,14 +172,14 @@ def after(around: CameraSurroundings, situation: ForecastState, set_points_degC:
         air = air + (target - air) * -np.expm1(-dt[:, 0] / _AIR_TAU_S)
         mean_air = (air + before_air) / 2
         inputs = [before_camera, mean_air, on]
-        _, _, _, *lags = _moved(of_air, [*inputs, *lags], inputs, dt)
+        _, _, _, *lags = _advance_follower(of_air, [*inputs, *lags], inputs, dt)
         camera = np.where(dt[:, 0] > 0, around.camera_degC(air, np.column_stack(lags)), before_camera)
         mean = [(camera + before_camera) / 2, mean_air, on]
-        values = _moved(of_model, [camera, mean_air, on, *values[3:]], mean, dt)
-    return ForecastState(target, air, np.column_stack(lags), _states(memory, values))
+        values = _advance_follower(of_model, [camera, mean_air, on, *values[3:]], mean, dt)
+    return ForecastState(target, air, np.column_stack(lags), _make_states(memory, values))
 
 
-def _moved(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float) -> list[Float]:
+def _advance_follower(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float) -> list[Float]:
     """After dt_s (S, 1), with these inputs now and in the mean."""
     follower.follow(now, [*mean, *now[3:]], (-np.expm1(-dt_s / follower.taus_s)).T, np.clip)
     return now
@@ -186,25 +188,27 @@ def _moved(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float)
 _PLACES = 7  # round number; nothing was measured
 # A camera at rest, 4 h after a change. Asked for 45 min after one instead, a cycle ended after 46 % of the fixed one's
 # time but left about four times as much at rest (6 drawn cameras: 7 to 27 mpx for 1 to 8).
-_AFTER_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the_way": 2700.0}
+_TIME_AT_SET_POINT_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the_way": 2700.0}
 
 
-def wanted_states(
-    around: CameraSurroundings, memory: ThermalMemory, range_degC: tuple[float, float], kinds: Sequence[WantedState]
+def list_wanted_states(
+    around: CameraSurroundings, memory: ThermalStateSpec, range_degC: tuple[float, float], kinds: Sequence[WantedState]
 ) -> ForecastState:
     """Of a powered camera throughout the range: so long after it was brought there from rest in the middle, or half way
     to either end. Both ways to a temperature and what creeps are in these. ValueError without a kind."""
     low, high = range_degC
     pairs = np.array(list(product(np.linspace(low, high, 5)[1:4], np.linspace(low, high, _PLACES))))
-    begun = at_rest(around, pairs[:, 0], memory)
-    return together([after(around, begun, pairs[:, 1], np.full(len(pairs), _AFTER_S[kind])) for kind in kinds])
+    begun = compute_equilibrium(around, pairs[:, 0], memory)
+    return concatenate_states(
+        [forecast(around, begun, pairs[:, 1], np.full(len(pairs), _TIME_AT_SET_POINT_S[kind])) for kind in kinds]
+    )
 
 
 # What creeps shows only in courses as long: with 4 h one drawn camera was left with 13.1 mpx at rest after 61 % of the
 # fixed cycle's time, with 8 h 7.7 after 60 %.
 _HORIZON_S = 8 * 3600.0
 # Time grows in proportion; each visit is decided again after the one before it.
-_DRAWN = 40
+_COURSES_PER_KIND = 40
 """Courses of each kind, drawn from the whole grid and from each of its thirds."""
 _THIRDS, _EVERY = 3, 3
 
@@ -229,7 +233,7 @@ class BestCourse:
     variance_px2: float
 
 
-def best_course(
+def find_best_course(
     known: DesignState,
     here: ForecastState,
     around: CameraSurroundings,
@@ -243,8 +247,8 @@ def best_course(
     moment = known.wanted.T @ known.wanted / len(known.wanted)
     best: BestCourse | None = None
     for soak_s in soaks_s:
-        set_points = _drawn(grid_degC, max(1, round(_HORIZON_S / soak_s)), rng)
-        variance_px2 = _after_courses(known, here, around, set_points, soak_s, moment)
+        set_points = _draw_courses(grid_degC, max(1, round(_HORIZON_S / soak_s)), rng)
+        variance_px2 = _compute_course_variances(known, here, around, set_points, soak_s, moment)
         first = int(np.argmin(variance_px2))
         found = BestCourse(float(set_points[first, 0]), soak_s, float(variance_px2[first]))
         best = found if best is None or found.variance_px2 < best.variance_px2 else best
@@ -253,7 +257,7 @@ def best_course(
     return best
 
 
-def _after_courses(
+def _compute_course_variances(
     known: DesignState,
     here: ForecastState,
     around: CameraSurroundings,
@@ -267,7 +271,7 @@ def _after_courses(
     at = here.where(np.zeros(count, np.int64))
     covariance = np.repeat(known.covariance[None], count, axis=0)
     for visit in set_points.T:
-        at = after(around, at, visit, np.full(count, soak_s))
+        at = forecast(around, at, visit, np.full(count, soak_s))
         own = known.features(at)
         gain = np.einsum("skl,sl->sk", covariance, own)
         total = known.noise_px2 + (gain * own).sum(axis=1)
@@ -275,13 +279,13 @@ def _after_courses(
     return np.einsum("skl,lk->s", covariance, moment)
 
 
-def _drawn(grid_degC: Float, visits: int, rng: np.random.Generator) -> Float:
+def _draw_courses(grid_degC: Float, visits: int, rng: np.random.Generator) -> Float:
     """(S, visits): to and fro, steadily up or down, staying at one temperature, and at one after the other. What creeps
     for hours shows in those that stay or go one way, which are hardly ever drawn by chance."""
     parts = [grid_degC, *(third for third in np.array_split(grid_degC, _THIRDS) if len(third))]
-    to_and_fro = [rng.choice(part, (_DRAWN, visits)) for part in parts]
-    up = [np.sort(rng.choice(part, (_DRAWN // 2, visits)), axis=1) for part in parts]
-    down = [np.sort(rng.choice(part, (_DRAWN // 2, visits)), axis=1)[:, ::-1] for part in parts]
+    to_and_fro = [rng.choice(part, (_COURSES_PER_KIND, visits)) for part in parts]
+    up = [np.sort(rng.choice(part, (_COURSES_PER_KIND // 2, visits)), axis=1) for part in parts]
+    down = [np.sort(rng.choice(part, (_COURSES_PER_KIND // 2, visits)), axis=1)[:, ::-1] for part in parts]
     staying = np.repeat(grid_degC[:, None], visits, axis=1)
     pairs = np.array(list(product(grid_degC[::_EVERY], repeat=2)))
     first = visits // 2
@@ -289,7 +293,7 @@ def _drawn(grid_degC: Float, visits: int, rng: np.random.Generator) -> Float:
     return np.concatenate([*to_and_fro, *up, *down, staying, both])
 
 
-def recorded_so_far(session: Path) -> Observations:
+def observe_partial_session(session: Path) -> Observations:
     """The frames so far, with the telemetry up to the last of them: what comes in while somebody waits for a decision
     changes nothing. SessionError when there is nothing to be read, or no frame can be used."""
     with tempfile.TemporaryDirectory(prefix="thermostand-known-") as folder:
@@ -297,14 +301,14 @@ def recorded_so_far(session: Path) -> Observations:
         for series in (TELEMETRY, FRAMES):
             (copy / series).mkdir(parents=True)
             for segment in sorted((session / series).iterdir()) if (session / series).is_dir() else ():
-                _taken(segment, copy / series)
+                _copy_segment(segment, copy / series)
         salvage_unfinished(Path(folder))
-        observed = observe(copy, incomplete=_unreported)
-        history = recorded_history(Session.open(copy), int(observed.time_ns[-1]))
+        observed = observe(copy, incomplete=_ignore_warning)
+        history = read_history(Session.open(copy), int(observed.time_ns[-1]))
         return replace(observed, histories=(history,))
 
 
-def _taken(segment: Path, folder: Path) -> None:
+def _copy_segment(segment: Path, folder: Path) -> None:
     """A segment may be finished between the list and the look at it."""
     finished = segment.with_name(f"{segment.name.partition('.')[0]}{FINISHED}")
     try:
@@ -318,7 +322,7 @@ def _taken(segment: Path, folder: Path) -> None:
         (folder / finished.name).symlink_to(finished.absolute())
 
 
-def _unreported(sentence: str) -> None:
+def _ignore_warning(sentence: str) -> None:
     """A night under way lacks its rest."""
 
 
@@ -330,11 +334,11 @@ _UNCHECKED = "what the model leaves between set-points is seen at three of them"
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class DesignGoal:
     """What a night is for, and within what it decides. range_degC: set-points at which the model is wanted; none
     outside is chosen, nor one of held_out_degC. residual_px: the predicted residual with which the night is content.
     soaks_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there, see
-    wanted_states."""
+    list_wanted_states."""
 
     range_degC: tuple[float, float]
     residual_px: float
@@ -356,29 +360,32 @@ class Decision:
     reason: str
 
 
-def decide(observations: Observations, wanted: Wanted) -> Decision:
+def decide(observations: Observations, wanted: DesignGoal) -> Decision:
     """What to do next. While no model can be fitted, the temperature that is furthest from those visited."""
-    grid = _grid(wanted)
+    grid = _make_grid(wanted)
     try:
         model = fit_thermal(observations)
-        around = surroundings(observations, wanted.ramp_K_per_min)
+        around = fit_surroundings(observations, wanted.ramp_K_per_min)
     except SessionError as error:
-        return _furthest(observations, wanted, grid, f"no model yet ({error})")
-    asked = wanted_states(around, model.memory, wanted.range_degC, wanted.states)
-    predicted_px = predicted_residual_px(model, asked)
+        return _choose_furthest(observations, wanted, grid, f"no model yet ({error})")
+    asked = list_wanted_states(around, model.memory, wanted.range_degC, wanted.states)
+    predicted_px = predict_residual_px(model, asked)
     if predicted_px <= wanted.residual_px:
         reason = f"the residual is predicted at {1e3 * predicted_px:.1f} mpx, {1e3 * wanted.residual_px:g} are wanted"
         return Decision("enough", math.nan, 0.0, predicted_px, reason)
-    if _few_between(observations) and _without_discrepancy_px(model, asked) <= wanted.residual_px:
-        return _furthest(observations, wanted, grid, _UNCHECKED)
+    if (
+        _has_few_interior_set_points(observations)
+        and _predict_without_discrepancy_px(model, asked) <= wanted.residual_px
+    ):
+        return _choose_furthest(observations, wanted, grid, _UNCHECKED)
     known = DesignState(
         model.leverage_matrix,
         float(model.discrepancy_px @ model.discrepancy_px),
-        _features(model, asked),
-        lambda situation: _features(model, situation),
+        _compute_features(model, asked),
+        lambda situation: _compute_features(model, situation),
     )
     seed = int(observations.time_ns[-1] % (1 << 32))
-    course = best_course(known, now(observations, model.memory), around, grid, wanted.soaks_s, seed)
+    course = find_best_course(known, read_current_state(observations, model.memory), around, grid, wanted.soaks_s, seed)
     reason = (
         f"the residual is predicted at {1e3 * predicted_px:.1f} mpx; {course.chamber_degC:g} degC for "
         f"{course.soak_s / 60:g} min begins the course that lowers it most"
@@ -386,7 +393,7 @@ def decide(observations: Observations, wanted: Wanted) -> Decision:
     return Decision("visit", course.chamber_degC, course.soak_s, predicted_px, reason)
 
 
-def predicted_residual_px(model: ThermalModel, asked: ForecastState) -> float:
+def predict_residual_px(model: ThermalModel, asked: ForecastState) -> float:
     """RMS of a coordinate over these situations and the outline of the markers, within the night."""
     hull_px = model.facts.hull_px
     situations, places = len(asked.air_degC), len(hull_px)
@@ -396,7 +403,7 @@ def predicted_residual_px(model: ThermalModel, asked: ForecastState) -> float:
     return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 2))
 
 
-def _grid(wanted: Wanted) -> Float:
+def _make_grid(wanted: DesignGoal) -> Float:
     """Set-points to choose from; SessionError never: the ends stay when all is held out."""
     grid = np.linspace(*wanted.range_degC, _GRID)
     held_out = np.array(wanted.held_out_degC)
@@ -404,28 +411,28 @@ def _grid(wanted: Wanted) -> Float:
     return np.round(grid[near >= _APART_K] if (near >= _APART_K).any() else grid[[0, -1]], 1)
 
 
-def _few_between(observations: Observations) -> bool:
+def _has_few_interior_set_points(observations: Observations) -> bool:
     """Whether too few set-points lie between others for what the model leaves at such ones."""
     # With fewer, the set-points that are left out are those at the ends, and a model claimed 100 to 700 mpx.
-    return len(_seen_degC(observations)) - 2 < FEWEST_BETWEEN
+    return len(_list_fitted_set_points(observations)) - 2 < FEWEST_BETWEEN
 
 
-def _without_discrepancy_px(model: ThermalModel, asked: ForecastState) -> float:
-    return predicted_residual_px(replace(model, discrepancy_px=np.zeros(2)), asked)
+def _predict_without_discrepancy_px(model: ThermalModel, asked: ForecastState) -> float:
+    return predict_residual_px(replace(model, discrepancy_px=np.zeros(2)), asked)
 
 
-def _seen_degC(observations: Observations) -> Float:
+def _list_fitted_set_points(observations: Observations) -> Float:
     """The set-points that a fit knows, each once."""
     return np.unique(observations.chamber_degC[observations.of(Role.REFERENCE, Role.FIT)])
 
 
-def _furthest(observations: Observations, wanted: Wanted, grid: Float, why: str) -> Decision:
-    seen = _seen_degC(observations)
+def _choose_furthest(observations: Observations, wanted: DesignGoal, grid: Float, why: str) -> Decision:
+    seen = _list_fitted_set_points(observations)
     distance_K = np.abs(grid[:, None] - seen).min(axis=1, initial=np.inf)
     degC, soak_s = float(grid[np.argmax(distance_K)]), max(wanted.soaks_s)
     return Decision("visit", degC, soak_s, math.nan, f"{why}; {degC:g} degC is furthest from the others")
 
 
-def _features(model: ThermalModel, situation: ForecastState) -> Float:
-    found = features(situation.states, [term.feature for term in model.terms], model.origin)
+def _compute_features(model: ThermalModel, situation: ForecastState) -> Float:
+    found = compute_features(situation.states, [term.feature for term in model.terms], model.origin)
     return found - model.reference_features

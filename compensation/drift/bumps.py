@@ -15,24 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from thermostand.compensation.drift.displacements import Displacements, anchors, displacements
-from thermostand.compensation.drift.facts import MOTIONS, Bump
-from thermostand.compensation.drift.terms import features, motions
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.displacements import Displacements, compute_displacements, find_reference_frames
+from thermostand.compensation.drift.model_facts import MOTIONS, Bump
+from thermostand.compensation.drift.terms import compute_features, compute_motions
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.drift_runtime import remembered
-from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, lag, play
-from thermostand.compensation.history.thermal_history import Float, ThermalMemory
+from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, backlash, lag
+from thermostand.compensation.history.thermal_history import Float, ThermalStateSpec
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 
 # Other kinds of wander (shorter, smoother, both) found no more and no fewer steps on drawn cameras.
-_WANDER_H = 2.0
+_OU_TIME_CONSTANT_H = 2.0
 # The likeliest of the 48 combinations is taken. They span what drawn cameras do in factors of three to five, so that a
 # value which is off by two lies within one step of the grid.
 _AMOUNTS_PX = (0.03, 0.15, 0.6)
-_WANDERS_PX = (0.0, 0.002, 0.006, 0.02)
+_OU_NOISES_PX = (0.0, 0.002, 0.006, 0.02)
 _NOISES_PX = (0.0005, 0.0015, 0.004, 0.012)
 _WIDE_PX = 3.0
 """What is known of a step that was found, before it is estimated."""
@@ -49,7 +49,7 @@ class StepScan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Whitened:
+class WhitenedSteps:
     """The grid's covariances (G, K, K) as inverse Cholesky factors, and their log determinants (G,); steps (G, K, B):
     the candidates, whitened."""
 
@@ -58,19 +58,19 @@ class Whitened:
     steps: Float
 
 
-def whitened(features: Float, hours: Float, variance_px2: Float, steps: Float, known: Float) -> Whitened:
+def whiten_steps(features: Float, hours: Float, variance_px2: Float, steps: Float, known: Float) -> WhitenedSteps:
     """features (K, H), about 1. hours (K,): of the instants. variance_px2 (K,): of the values' own noise. steps (K, B):
     the candidates, 0 or 1. known (K, S): steps that were found already."""
     inverses: list[Float] = []
-    for covariance, _ in _grid(features, hours, variance_px2, known):
+    for covariance, _ in _iterate_covariances(features, hours, variance_px2, known):
         lower = np.linalg.cholesky(covariance)
         inverses.append(np.asarray(solve_triangular(lower, np.eye(len(hours)), lower=True)))
     inverse = np.array(inverses)
     log_determinant = -2 * np.log(np.diagonal(inverse, axis1=1, axis2=2)).sum(axis=1)
-    return Whitened(inverse, log_determinant, inverse @ steps)
+    return WhitenedSteps(inverse, log_determinant, inverse @ steps)
 
 
-def scan(white: Whitened, values_px: Float) -> StepScan:
+def scan_steps(white: WhitenedSteps, values_px: Float) -> StepScan:
     """Of values (K,)."""
     own = white.inverse @ values_px
     without = -0.5 * ((own**2).sum(axis=1) + white.log_determinant)
@@ -86,11 +86,11 @@ def scan(white: Whitened, values_px: Float) -> StepScan:
     )
 
 
-def unexplained(features: Float, hours: Float, variance_px2: Float, known: Float, values_px: Float) -> Float:
+def estimate_unexplained(features: Float, hours: Float, variance_px2: Float, known: Float, values_px: Float) -> Float:
     """(K,): what neither the thermal state nor the known steps explain of values (K,), without their own noise: wander
     and scatter, as expected with the likeliest of the grid's covariances."""
     best, found = -np.inf, np.zeros(len(hours))
-    for covariance, of_rest in _grid(features, hours, variance_px2, known):
+    for covariance, of_rest in _iterate_covariances(features, hours, variance_px2, known):
         factor = cho_factor(covariance, lower=True)
         weights = np.asarray(cho_solve(factor, values_px))
         likelihood = float(-0.5 * values_px @ weights - np.log(np.diagonal(factor[0])).sum())
@@ -99,12 +99,14 @@ def unexplained(features: Float, hours: Float, variance_px2: Float, known: Float
     return found
 
 
-def _grid(features: Float, hours: Float, variance_px2: Float, known: Float) -> Iterator[tuple[Float, Float]]:
+def _iterate_covariances(
+    features: Float, hours: Float, variance_px2: Float, known: Float
+) -> Iterator[tuple[Float, Float]]:
     """Covariances (K, K) of values, and of the part that is wander and scatter."""
     of_features = features @ features.T
-    of_wander = np.exp(-np.abs(hours[:, None] - hours) / _WANDER_H)
+    of_wander = np.exp(-np.abs(hours[:, None] - hours) / _OU_TIME_CONSTANT_H)
     fixed = _WIDE_PX**2 * (known @ known.T + 1) + np.diag(variance_px2)
-    for amount, wander, noise in product(_AMOUNTS_PX, _WANDERS_PX, _NOISES_PX):
+    for amount, wander, noise in product(_AMOUNTS_PX, _OU_NOISES_PX, _NOISES_PX):
         of_rest = wander**2 * of_wander + noise**2 * np.eye(len(hours))
         yield fixed + amount**2 * of_features + of_rest, of_rest
 
@@ -116,7 +118,7 @@ Index = NDArray[np.int64]
 _ROLES = (Role.WARM_UP, Role.REFERENCE, Role.FIT, Role.VALIDATION)
 # A part of the lags and plays that a fit has: here they only have to tell drift from steps.
 _TAUS_S = (480.0, 1620.0, 6000.0, 18000.0)
-_PLAYS_K = (1.5, 3.0, 6.0, 10.0, 14.0)
+_BACKLASHES_K = (1.5, 3.0, 6.0, 10.0, 14.0)
 _FEATURES = (
     away(CAMERA),
     away(CAMERA) ** 2,
@@ -124,9 +126,9 @@ _FEATURES = (
     *(lag(POWER, tau_s) - 1 for tau_s in _TAUS_S),
     away(lag(CAMERA, _TAUS_S[1])),
     away(lag(CAMERA, _TAUS_S[1])) ** 2,
-    *(away(play(CAMERA, radius_K)) for radius_K in _PLAYS_K),
+    *(away(backlash(CAMERA, radius_K)) for radius_K in _BACKLASHES_K),
 )
-_FORGOTTEN_S = (900.0, 3600.0, 14400.0)
+_FADING_S = (900.0, 3600.0, 14400.0)
 """How what was before the record fades, when nobody knows it."""
 # A scan takes time with the cube of it. Longer sessions get coarser instants, up to 16 min; around a step that was
 # found the session is looked at again minute by minute.
@@ -139,7 +141,7 @@ _QUICK_S = 1200.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Frames:
+class _SeriesFrames:
     """What a series is condensed from. rows: of the frames that show the target in its place. label (M,): the instant
     of each, in order of time. features (F, H): of all frames."""
 
@@ -150,7 +152,7 @@ class _Frames:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NightSeries:
+class SessionSeries:
     """One session's K instants: means over the frames of each. first_ns, last_ns, hours (K,). features (K, H).
     motions_px, variance_px2 (K, 4): shift along I and J, turn and scale. left_px (K, N, 2): of each marker after all
     eight motions, NaN where it is missing; noise_px2 (K, N)."""
@@ -164,7 +166,7 @@ class NightSeries:
     variance_px2: Float
     left_px: Float
     noise_px2: Float
-    _frames: _Frames
+    _frames: _SeriesFrames
 
     @property
     def boundaries(self) -> Index:
@@ -175,11 +177,11 @@ class NightSeries:
         """(K, B): 1 from each of these instants on."""
         return (np.arange(len(self.hours))[:, None] >= before).astype(float)
 
-    def at_ns(self, before_ns: list[int]) -> Index:
+    def find_instants(self, before_ns: list[int]) -> Index:
         """The instants that begin at these times."""
         return np.searchsorted(self.first_ns, np.array(before_ns, np.int64))
 
-    def finer(self, before: int) -> NightSeries:
+    def refine(self, before: int) -> SessionSeries:
         """With each minute an instant of its own on both sides of the boundary before this instant; the same series
         where that is so already."""
         frames = self._frames
@@ -189,48 +191,48 @@ class NightSeries:
         label = np.unique(np.column_stack([frames.label, parts]), axis=0, return_inverse=True)[1].ravel()
         if label[-1] == frames.label[-1]:
             return self
-        return _condensed(self.session_id, _Frames(frames.observations, frames.rows, label, frames.features))
+        return _condense(self.session_id, _SeriesFrames(frames.observations, frames.rows, label, frames.features))
 
 
-def night_series(observations: Observations, index: int) -> NightSeries | None:
+def build_session_series(observations: Observations, index: int) -> SessionSeries | None:
     """Of session `index`; None with too few instants to tell. SessionError without anything to measure against."""
     frames = observations.of(*_ROLES) & (observations.session == index)
     if not frames.any():
         return None
-    of_frames, known = _features(observations)
+    of_frames, known = _compute_features(observations)
     frames &= known
     if not frames.any():
         return None
-    rows = displacements(observations, frames, anchors(observations))
+    rows = compute_displacements(observations, frames, find_reference_frames(observations))
     # Without frames of a camera or a target that was moved on purpose.
     rows = rows.where(np.linalg.norm(rows.displacement_px, axis=1) < _SAME_PLACE_PX)
     if not len(rows.frame):
         return None
-    label = _labels(observations, rows)
+    label = _label_instants(observations, rows)
     if label[-1] + 1 < _FEWEST:
         return None
-    return _condensed(observations.sessions[index].session_id, _Frames(observations, rows, label, of_frames))
+    return _condense(observations.sessions[index].session_id, _SeriesFrames(observations, rows, label, of_frames))
 
 
-def four_motions(xy_px: Float, image_size: tuple[int, int]) -> Float:
+def compute_rigid_motions(xy_px: Float, image_size: tuple[int, int]) -> Float:
     """(N, 2, 4): shift along I, along J, turn and scale."""
-    eight = motions(xy_px, image_size)
+    eight = compute_motions(xy_px, image_size)
     return np.stack([eight[..., 0], eight[..., 1], eight[..., 4] - eight[..., 3], eight[..., 2] + eight[..., 5]], -1)
 
 
-def _condensed(session_id: str, frames: _Frames) -> NightSeries:
-    moved, variance, left, noise = _of_instants(frames)
+def _condense(session_id: str, frames: _SeriesFrames) -> SessionSeries:
+    moved, variance, left, noise = _fit_instant_motions(frames)
     count, times_ns = len(moved), frames.observations.time_ns[frames.rows.frame]
     first, last = np.full(count, np.iinfo(np.int64).max), np.zeros(count, np.int64)
     np.minimum.at(first, frames.label, times_ns)
     np.maximum.at(last, frames.label, times_ns)
     hours = (first - first[0]) / NS_PER_S / 3600
-    return NightSeries(
+    return SessionSeries(
         session_id=session_id,
         first_ns=first,
         last_ns=last,
         hours=hours,
-        features=_mean_features(frames),
+        features=_average_features(frames),
         motions_px=moved,
         variance_px2=variance,
         left_px=left,
@@ -239,18 +241,18 @@ def _condensed(session_id: str, frames: _Frames) -> NightSeries:
     )
 
 
-def _features(observations: Observations) -> tuple[Float, Mask]:
+def _compute_features(observations: Observations) -> tuple[Float, Mask]:
     """(F, H) of all frames, and which are known (F,): none without a history of the air, where lag looks like steps."""
-    states = frame_states(observations, ThermalMemory(remembered(_FEATURES)))
+    states = compute_frame_states(observations, ThermalStateSpec(remembered(_FEATURES)))
     if not np.isfinite(observations.air_degC).any():
         return np.empty((len(observations.frame), 0)), np.zeros(len(observations.frame), bool)
     origin = Origin(float(np.nanmean(states.camera_degC)), float(np.nanmean(observations.air_degC)))
-    found = features(states, _FEATURES, origin)
-    fading = np.exp(-states.settled_s[:, None] / np.array(_FORGOTTEN_S))
+    found = compute_features(states, _FEATURES, origin)
+    fading = np.exp(-states.settled_s[:, None] / np.array(_FADING_S))
     return np.hstack([found, fading]), np.isfinite(found).all(axis=1) & ~(states.on_s < _QUICK_S)
 
 
-def _labels(observations: Observations, rows: Displacements) -> Index:
+def _label_instants(observations: Observations, rows: Displacements) -> Index:
     """(M,): each row's instant, in order of time. A minute of a step is one, or more in a long session."""
     frames, frame_of_row = np.unique(rows.frame, return_inverse=True)
     _, step = np.unique(np.array(observations.step_id)[frames], return_inverse=True)
@@ -265,7 +267,7 @@ def _labels(observations: Observations, rows: Displacements) -> Index:
     return label[frame_of_row.ravel()]
 
 
-def _mean_features(frames: _Frames) -> Float:
+def _average_features(frames: _SeriesFrames) -> Float:
     """(K, H): of the frames of an instant, which may be minutes apart and of a camera on its way, weighted as their
     mean places are."""
     rows, label = frames.rows, frames.label
@@ -275,7 +277,7 @@ def _mean_features(frames: _Frames) -> Float:
     return np.stack(found, axis=1)
 
 
-def _of_instants(frames: _Frames) -> tuple[Float, Float, Float, Float]:
+def _fit_instant_motions(frames: _SeriesFrames) -> tuple[Float, Float, Float, Float]:
     """motions (K, 4), their variance (K, 4), what eight motions leave of each marker (K, N, 2), its variance (K, N)."""
     observations, rows, label = frames.observations, frames.rows, frames.label
     instants, count = int(label[-1]) + 1, observations.target.count
@@ -292,12 +294,12 @@ def _of_instants(frames: _Frames) -> tuple[Float, Float, Float, Float]:
     for k in range(instants):
         own = seen[k]
         scale = np.sqrt(weight[k, own])
-        four = four_motions(at[k, own], observations.image_size)
+        four = compute_rigid_motions(at[k, own], observations.image_size)
         design = (four * scale[:, None, None]).reshape(-1, MOTIONS)
         inverse = np.linalg.pinv(design.T @ design)
         moved[k] = inverse @ design.T @ (place[k, own] * scale[:, None]).ravel()
         variance[k] = np.diagonal(inverse)
-        eight = motions(at[k, own], observations.image_size)
+        eight = compute_motions(at[k, own], observations.image_size)
         amounts = np.linalg.lstsq(eight.reshape(-1, 8), place[k, own].ravel(), rcond=None)[0]
         left[k, own] = place[k, own] - eight @ amounts
     return moved, variance, left, np.where(seen, 1 / np.where(seen, weight, 1.0), np.nan)
@@ -321,16 +323,16 @@ def find_bumps(observations: Observations) -> tuple[Bump, ...]:
     found: list[Bump] = []
     for index in range(len(observations.sessions)):
         try:
-            series = night_series(observations, index)
+            series = build_session_series(observations, index)
         except SessionError:  # nothing to measure against: the fit says so
             continue
         if series is not None:
-            found += sorted(_rigid(series), key=lambda bump: bump.after_ns)
-            found += sorted(_markers(series), key=lambda bump: bump.after_ns)
+            found += sorted(_find_rigid_bumps(series), key=lambda bump: bump.after_ns)
+            found += sorted(_find_marker_bumps(series), key=lambda bump: bump.after_ns)
     return tuple(found)
 
 
-def around_bumps(observations: Observations, bumps: tuple[Bump, ...]) -> Observations:
+def correct_bumps(observations: Observations, bumps: tuple[Bump, ...]) -> Observations:
     """With the centres where they would be had the camera stayed as it was when its reference was taken; each centre
     that was moved back has the step's variance, too."""
     centres, covariance = observations.centres_px.copy(), observations.covariance_px2.copy()
@@ -344,40 +346,40 @@ def around_bumps(observations: Observations, bumps: tuple[Bump, ...]) -> Observa
 def _move_back(observations: Observations, index: int, bump: Bump, centres: Float, covariance: Float) -> None:
     own = observations.session == index
     later = observations.time_ns >= bump.before_ns
-    reference = own & anchors(observations)
+    reference = own & find_reference_frames(observations)
     side = later if (reference & ~later).any() else ~later
     sign = 1.0 if side is later else -1.0
     frames = np.flatnonzero(own & side)
     markers = slice(None) if bump.marker is None else slice(bump.marker, bump.marker + 1)
-    moved = four_motions(observations.centres_px[frames, markers].reshape(-1, 2), observations.image_size)
+    moved = compute_rigid_motions(observations.centres_px[frames, markers].reshape(-1, 2), observations.image_size)
     shift = (moved @ np.array(bump.motions_px)).reshape(len(frames), -1, 2)
     variance = (moved**2 @ np.array(bump.sigma_px) ** 2).reshape(len(frames), -1, 2)
     centres[frames, markers] -= sign * shift
     covariance[frames, markers] += variance[..., None] * np.eye(2)
 
 
-def _rigid(series: NightSeries) -> Iterator[Bump]:
+def _find_rigid_bumps(series: SessionSeries) -> Iterator[Bump]:
     """Steps of the whole image, the largest first, each beside those found before it; then all estimated together.
     Where one is found the series is looked at minute by minute: a step amidst an instant looks like two halves."""
     before_ns: list[int] = []
     while len(before_ns) < _MOST:
-        best, size_px = _largest(series, series.at_ns(before_ns))
-        finer = series.finer(best)
+        best, size_px = _find_largest_step(series, series.find_instants(before_ns))
+        finer = series.refine(best)
         if size_px < _LEAST_PX * (1.0 if finer is series else _BLURRED):
             break
         if finer is series:
             before_ns.append(int(series.first_ns[best]))
         series = finer
-    known = series.at_ns(before_ns)
+    known = series.find_instants(before_ns)
     for own in known.tolist():
-        found = _scans(series, np.array([own]), known[known != own])
+        found = _scan_axes(series, np.array([own]), known[known != own])
         amounts = tuple(float(one.amount_px[0]) for one in found)
-        yield _bump(series, own, amounts, tuple(float(one.sigma_px[0]) for one in found), None)
+        yield _make_bump(series, own, amounts, tuple(float(one.sigma_px[0]) for one in found), None)
 
 
-def _largest(series: NightSeries, known: Index) -> tuple[int, float]:
+def _find_largest_step(series: SessionSeries, known: Index) -> tuple[int, float]:
     """The boundary where one more step explains most, and its size, px; 0 where it explains too little."""
-    scans = _scans(series, series.boundaries, known)
+    scans = _scan_axes(series, series.boundaries, known)
     gain = np.sum([own.gain for own in scans], axis=0)
     gain[np.isin(series.boundaries, known)] = -np.inf
     best = int(np.argmax(gain))
@@ -385,22 +387,22 @@ def _largest(series: NightSeries, known: Index) -> tuple[int, float]:
     return int(series.boundaries[best]), float(size) if gain[best] >= _GAIN else 0.0
 
 
-def _scans(series: NightSeries, boundaries: Index, known: Index) -> list[StepScan]:
+def _scan_axes(series: SessionSeries, boundaries: Index, known: Index) -> list[StepScan]:
     return [
-        scan(
-            _white(series, series.variance_px2[:, axis], boundaries, known),
+        scan_steps(
+            _whiten(series, series.variance_px2[:, axis], boundaries, known),
             series.motions_px[:, axis],
         )
         for axis in range(MOTIONS)
     ]
 
 
-def _white(series: NightSeries, variance_px2: Float, boundaries: Index, known: Index) -> Whitened:
-    return whitened(series.features, series.hours, variance_px2, series.steps(boundaries), series.steps(known))
+def _whiten(series: SessionSeries, variance_px2: Float, boundaries: Index, known: Index) -> WhitenedSteps:
+    return whiten_steps(series.features, series.hours, variance_px2, series.steps(boundaries), series.steps(known))
 
 
-def _bump(
-    series: NightSeries, before: int, amounts: tuple[float, ...], sigma: tuple[float, ...], marker: int | None
+def _make_bump(
+    series: SessionSeries, before: int, amounts: tuple[float, ...], sigma: tuple[float, ...], marker: int | None
 ) -> Bump:
     after_ns, before_ns = int(series.last_ns[before - 1]), int(series.first_ns[before])
     return Bump(
@@ -413,20 +415,20 @@ def _bump(
     )
 
 
-def _markers(series: NightSeries) -> Iterator[Bump]:
+def _find_marker_bumps(series: SessionSeries) -> Iterator[Bump]:
     """Steps of single markers, which the eight motions of all cannot follow."""
     complete = np.asarray(np.isfinite(series.left_px).all(axis=(0, 2)))
     if not complete.any():
         return
-    white = _white(series, np.nanmedian(series.noise_px2, axis=1), series.boundaries, np.empty(0, np.int64))
+    white = _whiten(series, np.nanmedian(series.noise_px2, axis=1), series.boundaries, np.empty(0, np.int64))
     for marker in np.flatnonzero(complete).tolist():
-        i, j = (scan(white, series.left_px[:, marker, axis]) for axis in (0, 1))
+        i, j = (scan_steps(white, series.left_px[:, marker, axis]) for axis in (0, 1))
         gain = i.gain + j.gain
         best = int(np.argmax(gain))
         amount = float(i.amount_px[best]), float(j.amount_px[best])
         if gain[best] > _GAIN_MARKER and np.hypot(*amount) > _LEAST_MARKER_PX:
             sigma = float(i.sigma_px[best]), float(j.sigma_px[best])
-            yield _bump(series, int(series.boundaries[best]), (*amount, 0.0, 0.0), (*sigma, 0.0, 0.0), marker)
+            yield _make_bump(series, int(series.boundaries[best]), (*amount, 0.0, 0.0), (*sigma, 0.0, 0.0), marker)
 
 
 # What of a night's drift no thermal state explains and no single step either: fixings that slip again and again, or
@@ -452,7 +454,7 @@ class Cause(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Unrepeated:
+class UnrepeatedMotion:
     """Of one session. cause: what it is like. along_px, across_px: RMS along the line on which most is left, and across
     it; direction_deg: of that line, from I towards J, -90..90. text: in a sentence."""
 
@@ -464,21 +466,21 @@ class Unrepeated:
     text: str
 
 
-def find_unrepeated(observations: Observations, bumps: Sequence[Bump]) -> tuple[Unrepeated, ...]:
+def find_unrepeated(observations: Observations, bumps: Sequence[Bump]) -> tuple[UnrepeatedMotion, ...]:
     """Of each session with enough instants to tell, beside the steps that were found in it."""
-    found: list[Unrepeated] = []
+    found: list[UnrepeatedMotion] = []
     for index in range(len(observations.sessions)):
         try:
-            series = night_series(observations, index)
+            series = build_session_series(observations, index)
         except SessionError:  # nothing to measure against: the fit says so
             continue
         if series is None:
             continue
         own = [one.before_ns for one in bumps if one.session_id == series.session_id and one.marker is None]
-        known = series.steps(series.at_ns(own))
+        known = series.steps(series.find_instants(own))
         left = np.stack(
             [
-                unexplained(
+                estimate_unexplained(
                     series.features, series.hours, series.variance_px2[:, axis], known, series.motions_px[:, axis]
                 )
                 for axis in (0, 1)
@@ -488,19 +490,19 @@ def find_unrepeated(observations: Observations, bumps: Sequence[Bump]) -> tuple[
         across_px, along_px = np.sqrt(np.maximum(values, 0.0)).tolist()
         i, j = vectors[:, 1].tolist()
         direction_deg = (math.degrees(math.atan2(j, i)) + 90) % 180 - 90
-        cause = _cause(along_px, across_px)
-        text = _text(cause, 1e3 * along_px, 1e3 * across_px, direction_deg)
-        found.append(Unrepeated(series.session_id, cause, along_px, across_px, direction_deg, text))
+        cause = _classify_cause(along_px, across_px)
+        text = _describe_cause(cause, 1e3 * along_px, 1e3 * across_px, direction_deg)
+        found.append(UnrepeatedMotion(series.session_id, cause, along_px, across_px, direction_deg, text))
     return tuple(found)
 
 
-def _cause(along_px: float, across_px: float) -> Cause:
+def _classify_cause(along_px: float, across_px: float) -> Cause:
     if along_px < _LEAST_UNREPEATED_PX:
         return Cause.NOTHING
     return Cause.SLIPS if along_px > _ONE_LINE * across_px else Cause.SETTLING
 
 
-def _text(cause: Cause, along_mpx: float, across_mpx: float, direction_deg: float) -> str:
+def _describe_cause(cause: Cause, along_mpx: float, across_mpx: float, direction_deg: float) -> str:
     match cause:
         case Cause.SLIPS:
             return (

@@ -16,7 +16,7 @@ Pair = tuple[float, float]
 
 # With two the variance has one degree of freedom, for which Student's factor is 6.5.
 FEWEST_BETWEEN = 3
-NO_MATTER_PX = 0.0005
+NEGLIGIBLE_PX = 0.0005
 """Worse by less than anybody measures."""
 
 
@@ -39,7 +39,7 @@ class Candidate(Document):
     fold_rms_px: tuple[Pair, ...]
 
     @model_validator(mode="after")
-    def _fits_together(self) -> Candidate:
+    def _check_consistent(self) -> Candidate:
         check_folds(self.fold_chamber_degC, self.fold_rms_px)
         return self
 
@@ -51,7 +51,7 @@ class Candidate(Document):
     @property
     def squares_between(self) -> Float:
         """(folds,): of the set-points between others, by which forms and families are chosen."""
-        return self.fold_squares[between(np.array(self.fold_chamber_degC))]
+        return self.fold_squares[find_interior(np.array(self.fold_chamber_degC))]
 
 
 def check_folds(fold_chamber_degC: tuple[float, ...], fold_rms_px: tuple[Pair, ...]) -> None:
@@ -60,28 +60,28 @@ def check_folds(fold_chamber_degC: tuple[float, ...], fold_rms_px: tuple[Pair, .
         raise ValueError(f"fold_rms_px: {len(fold_rms_px)} for {len(fold_chamber_degC)} set-points")
 
 
-def pair_of(values: Float) -> Pair:
+def make_pair(values: Float) -> Pair:
     """Of (2,)."""
     i, j = values.tolist()
     return i, j
 
 
-def rms_px(deviations: Float) -> Pair:
+def compute_rms_px(deviations: Float) -> Pair:
     """RMS of deviations (M, 2) along I and J."""
-    return pair_of(np.sqrt((deviations**2).mean(axis=0)))
+    return make_pair(np.sqrt((deviations**2).mean(axis=0)))
 
 
-def moving_rms_px(residual: Float) -> Pair | None:
+def compute_moving_rms_px(residual: Float) -> Pair | None:
     """RMS of residuals (M, 2) of frames that were not at rest; None where there are none."""
-    return rms_px(residual) if len(residual) else None
+    return compute_rms_px(residual) if len(residual) else None
 
 
-def fold_means(rows: Displacements, values: Float) -> Float:
+def average_folds(rows: Displacements, values: Float) -> Float:
     """Means (folds, 2) of values (M, 2) over each chamber set-point."""
     return np.array([values[rows.chamber_degC == fold].mean(axis=0) for fold in np.unique(rows.chamber_degC)])
 
 
-def between(chamber_degC: Float) -> NDArray[np.bool_]:
+def find_interior(chamber_degC: Float) -> NDArray[np.bool_]:
     """(M,): set-points that have others on both sides; all, when fewer than three have.
 
     Without the coldest or the warmest a fit has to extrapolate, which the model is flagged for and need not claim to
@@ -91,19 +91,19 @@ def between(chamber_degC: Float) -> NDArray[np.bool_]:
     return inner if len(np.unique(chamber_degC[inner])) >= FEWEST_BETWEEN else np.ones(len(chamber_degC), bool)
 
 
-def discrepancy_px(rows: Displacements, held_out: Float) -> Float:
+def compute_discrepancy_px(rows: Displacements, held_out: Float) -> Float:
     """(2,): RMS of the held-out residuals (M, 2) of set-points between others, each counting the same, after the noise
     of the markers is taken off; 0 when noise explains all.
 
     It is a standard deviation known from n folds only. Student's t for n - 1 degrees of freedom instead of the normal
     distribution makes the 95 % interval right again: a factor of 1.15 for 10 folds, 2.2 for 3.
     """
-    inner = between(rows.chamber_degC)
-    squares = fold_means(rows.where(inner), (held_out**2 - rows.variance_px2)[inner])
-    return _student_factor(len(squares)) * np.sqrt(np.maximum(squares.mean(axis=0), 0))
+    inner = find_interior(rows.chamber_degC)
+    squares = average_folds(rows.where(inner), (held_out**2 - rows.variance_px2)[inner])
+    return _compute_student_factor(len(squares)) * np.sqrt(np.maximum(squares.mean(axis=0), 0))
 
 
-def _student_factor(folds: int) -> float:
+def _compute_student_factor(folds: int) -> float:
     """The 95 % quantile of Student's t over that of the normal distribution (Cornish-Fisher, third order, 3 % off at 2
     degrees of freedom, 1 % at 3)."""
     freedom, z = max(folds - 1, 2), 1.959964
@@ -113,7 +113,7 @@ def _student_factor(folds: int) -> float:
     return 1 + first / freedom + second / freedom**2 + third / freedom**3
 
 
-def as_good_as_best(fold_squares: Sequence[Float]) -> list[int]:
+def list_equivalent_to_best(fold_squares: Sequence[Float]) -> list[int]:
     """The candidates whose held-out mean square is within one standard error of the best, the best included.
 
     The standard error is that of the difference, fold by fold: what is common to both (a set-point that is hard for

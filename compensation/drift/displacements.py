@@ -39,7 +39,7 @@ class Displacements:
         return Displacements(*(getattr(self, field.name)[mask] for field in fields(self)))
 
 
-def anchors(observations: Observations) -> Mask:
+def find_reference_frames(observations: Observations) -> Mask:
     """(F,): the frames that displacements are measured against: each session's REFERENCE frames; in a session that has
     none the last frames of its first warm-up, so that a recorded warm-up can be learned from by itself."""
     found = observations.of(Role.REFERENCE)
@@ -52,7 +52,7 @@ def anchors(observations: Observations) -> Mask:
     return found
 
 
-def reference_centres(observations: Observations, frames: Mask | None = None) -> tuple[Float, Float]:
+def average_reference_centres(observations: Observations, frames: Mask | None = None) -> tuple[Float, Float]:
     """Mean centres (S, N, 2) and their variance (S, N, 2) over each session's own `frames` (F,), by default its
     REFERENCE frames; NaN without any.
 
@@ -67,30 +67,32 @@ def reference_centres(observations: Observations, frames: Mask | None = None) ->
         count = np.isfinite(measured).sum(axis=0)
         seen = count > 0
         centres[index][seen] = np.nansum(measured, axis=0)[seen] / count[seen]
-        variance[index][seen] = np.nansum(_variance_px2(observations)[own], axis=0)[seen] / count[seen] ** 2
+        variance[index][seen] = np.nansum(_get_variance_px2(observations)[own], axis=0)[seen] / count[seen] ** 2
     return centres, variance
 
 
-def displacements(observations: Observations, frames: Mask, against: Mask | None = None) -> Displacements:
+def compute_displacements(observations: Observations, frames: Mask, against: Mask | None = None) -> Displacements:
     """The measured centres of `frames` (F,) against the references of their sessions, the mean of the frames `against`
     (F,), by default the REFERENCE frames; markers without either are left out. SessionError when a session of these
     frames has no reference frames."""
-    centres, variance = reference_centres(observations, against)
+    centres, variance = average_reference_centres(observations, against)
     for index in np.unique(observations.session[frames]):
         if not np.isfinite(centres[index]).any():
             name = observations.sessions[index].session_id
             raise SessionError(f"session {name} has no usable reference frames to measure the drift against")
-    return displacements_from(observations, frames, centres[observations.session], variance[observations.session])
+    return compute_displacements_from(
+        observations, frames, centres[observations.session], variance[observations.session]
+    )
 
 
-def displacements_from(
+def compute_displacements_from(
     observations: Observations, frames: Mask, reference_px: Float, reference_px2: Float | float = 0.0
 ) -> Displacements:
     """The measured centres of `frames` (F,) against references, (F, N, 2) or (N, 2) for all, and their variances;
     markers without either are left out."""
     displacement = reference_px - observations.centres_px
     frame, marker = np.nonzero(frames[:, None] & np.isfinite(displacement).all(axis=2))
-    variance = _variance_px2(observations) + reference_px2
+    variance = _get_variance_px2(observations) + reference_px2
     return Displacements(
         measured_px=observations.centres_px[frame, marker],
         displacement_px=displacement[frame, marker],
@@ -102,6 +104,6 @@ def displacements_from(
     )
 
 
-def _variance_px2(observations: Observations) -> Float:
+def _get_variance_px2(observations: Observations) -> Float:
     """(F, N, 2): the diagonals of the covariances."""
     return np.diagonal(observations.covariance_px2, axis1=2, axis2=3)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.drift.candidates import Candidate, Pair
-from thermostand.compensation.drift.facts import ModelFacts
-from thermostand.compensation.drift.hull import MARGIN_PX, distances_px
-from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
+from thermostand.compensation.drift.hull import MARGIN_PX, compute_distances_px
+from thermostand.compensation.drift.model_facts import ModelFacts
+from thermostand.compensation.history.thermal_history import Float, States, ThermalStateSpec
 
 Flags = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -60,7 +60,7 @@ class DriftModel(ABC):
 
     @property
     @abstractmethod
-    def memory(self) -> ThermalMemory:
+    def memory(self) -> ThermalStateSpec:
         """What has to be remembered for it: thermal_history.states_at and state_of take it."""
 
     @abstractmethod
@@ -73,7 +73,7 @@ class DriftModel(ABC):
 
         ValueError when not a single point has an answer, as in states that are not known.
         """
-        points = points_of(xy_px)
+        points = check_points(xy_px)
         corrected = points + self.shift(points, state)
         known = np.isfinite(points).all(axis=1)
         if known.any() and not np.isfinite(corrected[known]).any():
@@ -98,7 +98,7 @@ class DriftModel(ABC):
         return self.flags(xy_px, state) == 0
 
 
-def states_of(state: Situation, count: int, memory: ThermalMemory) -> States:
+def broadcast_states(state: Situation, count: int, memory: ThermalStateSpec) -> States:
     """One state for each of `count` points. ValueError when there are more or fewer, or a temperature alone is given to
     a form that remembers."""
     if not isinstance(state, States):
@@ -116,7 +116,7 @@ def states_of(state: Situation, count: int, memory: ThermalMemory) -> States:
     return state if found == count else state.where(np.zeros(count, np.int64))
 
 
-def points_of(xy_px: Float) -> Float:
+def check_points(xy_px: Float) -> Float:
     """Points (N, 2), px, also from lists; ValueError when they are none."""
     points = np.asarray(xy_px, np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
@@ -124,12 +124,12 @@ def points_of(xy_px: Float) -> Float:
     return points
 
 
-def place_flags(xy_px: Float, hull_px: Float) -> Flags:
+def compute_place_flags(xy_px: Float, hull_px: Float) -> Flags:
     """(N,): PLACE outside the hull, or without a place."""
-    outside = ~(distances_px(xy_px, hull_px) >= -MARGIN_PX).all(axis=1)
+    outside = ~(compute_distances_px(xy_px, hull_px) >= -MARGIN_PX).all(axis=1)
     return np.where(outside, np.uint8(Outside.PLACE), np.uint8(0))
 
 
-def range_flags(values: Float, limits: Pair, flag: Outside) -> Flags:
+def compute_range_flags(values: Float, limits: Pair, flag: Outside) -> Flags:
     """(N,): the flag where a value is outside the limits, or NaN."""
     return np.where((values >= limits[0]) & (values <= limits[1]), np.uint8(0), np.uint8(flag))

@@ -7,14 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.drift.bumps import around_bumps
-from thermostand.compensation.drift.candidates import Pair, pair_of, rms_px
-from thermostand.compensation.drift.displacements import Displacements, displacements
+from thermostand.compensation.drift.bumps import correct_bumps
+from thermostand.compensation.drift.candidates import Pair, compute_rms_px, make_pair
+from thermostand.compensation.drift.displacements import Displacements, compute_displacements
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.paper_model import PaperModel, degrees_for, left_out, scaling_of
-from thermostand.compensation.drift.thermal_learning import left_out_thermal
+from thermostand.compensation.drift.paper_model import (
+    PaperModel,
+    compute_left_out_residuals,
+    list_degrees,
+    make_scaling,
+)
+from thermostand.compensation.drift.thermal_fit import cross_validate_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.observations import Float, Mask, Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
@@ -63,29 +68,29 @@ class Evaluation:
     @property
     def rms_before_px(self) -> Pair:
         """RMS along I and J before compensation, px."""
-        return rms_px(self.before_px)
+        return compute_rms_px(self.before_px)
 
     @property
     def rms_after_px(self) -> Pair:
         """RMS along I and J after compensation, px."""
-        return rms_px(self.after_px)
+        return compute_rms_px(self.after_px)
 
 
 def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
     """Score the model on the VALIDATION frames; a session without any is scored by leaving out one temperature at a
     time, each time with a new fit of the same terms. SessionError when the frames are of another camera or target."""
     check_same(model, observations)
-    observations = around_bumps(observations, model.facts.bumps)
+    observations = correct_bumps(observations, model.facts.bumps)
     frames = observations.of(Role.VALIDATION)
-    states = frame_states(observations, model.memory)
+    states = compute_frame_states(observations, model.memory)
     if frames.any():
-        rows = displacements(observations, frames)
+        rows = compute_displacements(observations, frames)
         after = rows.displacement_px - model.shift(rows.measured_px, states.where(rows.frame))
         method = "held-out temperatures"
     else:
-        rows, after = _left_out(model, observations)
+        rows, after = _cross_validate(model, observations)
         method = "no held-out frames: one temperature left out at a time"
-    rows, after = _answered(rows, after)
+    rows, after = _select_answered(rows, after)
     at_rows = states.where(rows.frame)
     own = model.of_sessions(session.session_id for session in observations.sessions)
     claimed = np.diagonal(own.covariance(rows.measured_px, at_rows), axis1=1, axis2=2) + rows.variance_px2
@@ -98,8 +103,8 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
         after_px=after,
         claimed_px2=claimed,
         outside=~model.inside(rows.measured_px, at_rows),
-        coverage_95=_coverage(after, claimed),
-        temperatures=_by_temperature(rows, after),
+        coverage_95=_compute_coverage(after, claimed),
+        temperatures=_group_by_temperature(rows, after),
         simulated=observations.simulated,
     )
 
@@ -113,20 +118,20 @@ def check_same(model: DriftModel, observations: Observations) -> None:
         raise SessionError(f"the model is of images of {facts.image_size} px, the session of {observations.image_size}")
 
 
-def _left_out(model: DriftModel, observations: Observations) -> tuple[Displacements, Float]:
+def _cross_validate(model: DriftModel, observations: Observations) -> tuple[Displacements, Float]:
     """The rows at set-points, and their residuals (M, 2) of new fits of the same form."""
     if isinstance(model, ThermalModel):
-        return left_out_thermal(model, observations)
-    rows = displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
+        return cross_validate_thermal(model, observations)
+    rows = compute_displacements(observations, observations.of(Role.REFERENCE, Role.FIT))
     degree = model.degree if isinstance(model, PaperModel) else 1
-    degrees_for(rows, degree)
+    list_degrees(rows, degree)
     try:
-        return rows, left_out(rows, degree, scaling_of(observations, rows))
+        return rows, compute_left_out_residuals(rows, degree, make_scaling(observations, rows))
     except np.linalg.LinAlgError as error:
         raise SessionError(f"the markers do not determine a polynomial of degree {degree}") from error
 
 
-def _answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
+def _select_answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
     """What the model had an answer for; it has none where the thermal state is unknown."""
     known: Mask = np.isfinite(after[:, 0])
     if not known.any():
@@ -134,11 +139,11 @@ def _answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
     return rows.where(known), after[known]
 
 
-def _coverage(after: Float, claimed: Float) -> Pair:
-    return pair_of((np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0))
+def _compute_coverage(after: Float, claimed: Float) -> Pair:
+    return make_pair((np.abs(after) <= _SIGMA_95 * np.sqrt(claimed)).mean(axis=0))
 
 
-def _by_temperature(rows: Displacements, after: Float) -> tuple[TemperatureRms, ...]:
+def _group_by_temperature(rows: Displacements, after: Float) -> tuple[TemperatureRms, ...]:
     found: list[TemperatureRms] = []
     for chamber_degC in np.unique(rows.chamber_degC):
         here = rows.chamber_degC == chamber_degC
@@ -148,19 +153,19 @@ def _by_temperature(rows: Displacements, after: Float) -> tuple[TemperatureRms, 
                 chamber_degC=float(chamber_degC),
                 camera_degC=float(rows.camera_degC[here][first].mean()),
                 frames=len(frames),
-                before_px=rms_px(rows.displacement_px[here]),
-                after_px=rms_px(after[here]),
+                before_px=compute_rms_px(rows.displacement_px[here]),
+                after_px=compute_rms_px(after[here]),
             )
         )
     return tuple(found)
 
 
-def improvement_percent(before_px: float, after_px: float) -> float:
+def compute_improvement_percent(before_px: float, after_px: float) -> float:
     """By how much the RMS has shrunk; negative when it has grown, NaN when there was nothing to shrink."""
     return 100 * (1 - after_px / before_px) if before_px > 0 else float("nan")
 
 
-def table(evaluation: Evaluation) -> str:
+def format_table(evaluation: Evaluation) -> str:
     """The paper's result and ours side by side, as text."""
     name = "this session (simulated)" if evaluation.simulated else "this session"
     width = len(name) + 2
@@ -168,13 +173,13 @@ def table(evaluation: Evaluation) -> str:
         "RMS deviation from the reference position, px",
         f"{'':<{width}}{'along I':>26}{'along J':>30}",
         f"{'':<{width}}" + 2 * f"{'before':>10}{'after':>10}{'gain':>8}  ",
-        f"{'paper':<{width}}" + _cells(PAPER_BEFORE_PX, PAPER_AFTER_PX),
-        f"{name:<{width}}" + _cells(evaluation.rms_before_px, evaluation.rms_after_px),
+        f"{'paper':<{width}}" + _format_cells(PAPER_BEFORE_PX, PAPER_AFTER_PX),
+        f"{name:<{width}}" + _format_cells(evaluation.rms_before_px, evaluation.rms_after_px),
         f"{evaluation.frames} frames; {evaluation.method}",
     ]
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _cells(before: Pair, after: Pair) -> str:
+def _format_cells(before: Pair, after: Pair) -> str:
     pairs = zip(before, after, strict=True)
-    return "".join(f"{b:10.3f}{a:10.3f}{improvement_percent(b, a):6.0f} %  " for b, a in pairs)
+    return "".join(f"{b:10.3f}{a:10.3f}{compute_improvement_percent(b, a):6.0f} %  " for b, a in pairs)

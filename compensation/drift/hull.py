@@ -14,7 +14,7 @@ _LEAST_WIDTH_PX = 5.0
 """Markers in one line, too, span a few px across it when they drift; a second row of them is many px away."""
 
 
-def convex_hull(points: Float) -> Float:
+def compute_convex_hull(points: Float) -> Float:
     """The corners (H, 2) of points (M, 2), in the sense that turns x towards y, from the leftmost on; points that span
     no area are their own corners."""
     try:
@@ -30,11 +30,11 @@ def is_area(hull_px: Float) -> bool:
     sides = np.linalg.norm(np.roll(hull_px, -1, axis=0) - hull_px, axis=1)
     if len(hull_px) < 3 or sides.min() == 0:
         return False
-    distances = distances_px(hull_px, hull_px)
+    distances = compute_distances_px(hull_px, hull_px)
     return bool(distances.min() > -MARGIN_PX and distances.max(axis=0).min() > _LEAST_WIDTH_PX)
 
 
-def distances_px(xy_px: Float, hull_px: Float) -> Float:
+def compute_distances_px(xy_px: Float, hull_px: Float) -> Float:
     """How far points (N, 2) are inside each side of the hull (H, 2), shape (N, H); negative is outside."""
     sides = np.roll(hull_px, -1, axis=0) - hull_px
     along = sides / np.linalg.norm(sides, axis=1, keepdims=True)

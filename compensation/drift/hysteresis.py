@@ -14,10 +14,10 @@ from itertools import combinations, groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.drift.bumps import around_bumps
-from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.bumps import correct_bumps
+from thermostand.compensation.drift.displacements import compute_displacements
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.history.thermal_history import Float
 from thermostand.compensation.observations import Mask, Observations
 from thermostand.experiments.steps import Role
@@ -65,24 +65,24 @@ class _Visit:
     variance_px2: Float
 
 
-def hysteresis(observations: Observations, model: DriftModel | None = None) -> tuple[Hysteresis, ...]:
+def compute_hysteresis(observations: Observations, model: DriftModel | None = None) -> tuple[Hysteresis, ...]:
     """Of each session that has reference frames; after compensation with `model`, before it without."""
     if model is not None:
-        observations = around_bumps(observations, model.facts.bumps)
+        observations = correct_bumps(observations, model.facts.bumps)
     found: list[Hysteresis] = []
     for index, facts in enumerate(observations.sessions):
         own = observations.of(*_CYCLE) & (observations.session == index)
         if (own & observations.of(Role.REFERENCE)).any():
-            found.append(_of_session(facts.session_id, _visits(observations, own, model)))
+            found.append(_compute_session_hysteresis(facts.session_id, _collect_visits(observations, own, model)))
     return tuple(found)
 
 
-def _visits(observations: Observations, own: Mask, model: DriftModel | None) -> list[_Visit]:
+def _collect_visits(observations: Observations, own: Mask, model: DriftModel | None) -> list[_Visit]:
     """In order of time; frames of one set-point that follow each other are a visit."""
-    rows = displacements(observations, own)
+    rows = compute_displacements(observations, own)
     place = -rows.displacement_px
     if model is not None:
-        states = frame_states(observations, model.memory)
+        states = compute_frame_states(observations, model.memory)
         place = place + model.shift(rows.measured_px, states.where(rows.frame))
     shape = (len(observations.frame), observations.target.count, 2)
     of_frame, variance = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -91,12 +91,12 @@ def _visits(observations: Observations, own: Mask, model: DriftModel | None) -> 
     for chamber_degC, group in groupby(np.flatnonzero(own).tolist(), key=lambda k: float(observations.chamber_degC[k])):
         frames = np.array(list(group))
         before = visits[-1].chamber_degC if visits else None
-        mean, uncertain = _mean(of_frame[frames], variance[frames])
+        mean, uncertain = _average_frames(of_frame[frames], variance[frames])
         visits.append(_Visit(chamber_degC, None if before is None else chamber_degC > before, mean, uncertain))
     return visits
 
 
-def _mean(values: Float, variance: Float) -> tuple[Float, Float]:
+def _average_frames(values: Float, variance: Float) -> tuple[Float, Float]:
     """Over the frames that have the marker."""
     count = np.isfinite(values).sum(axis=0)
     safe = np.maximum(count, 1)
@@ -104,11 +104,11 @@ def _mean(values: Float, variance: Float) -> tuple[Float, Float]:
     return mean, np.where(count > 0, np.nansum(variance, axis=0) / safe**2, np.nan)
 
 
-def _of_session(session_id: str, visits: list[_Visit]) -> Hysteresis:
+def _compute_session_hysteresis(session_id: str, visits: list[_Visit]) -> Hysteresis:
     centres = np.array([np.nanmean(visit.place_px, axis=0) for visit in visits])
     reference = [visit for visit in visits if visit.chamber_degC == visits[0].chamber_degC]
     closure = reference[-1].place_px - reference[0].place_px
-    gaps = tuple(_gaps(visits))
+    gaps = tuple(_compute_branch_differences(visits))
     apart_px = np.array([gap.difference_px for gap in gaps]).reshape(-1, 2)
     unknown = np.full(2, np.nan)
     return Hysteresis(
@@ -118,12 +118,12 @@ def _of_session(session_id: str, visits: list[_Visit]) -> Hysteresis:
         rms_px=np.sqrt((apart_px**2).mean(axis=0)) if gaps else unknown,
         area_px_K=np.asarray(np.trapezoid(np.abs(apart_px), [gap.chamber_degC for gap in gaps], axis=0)).reshape(-1),
         closure_px=np.nanmean(closure, axis=0) if len(reference) > 1 else unknown,
-        repeatability_px=_repeatability_px(visits),
+        repeatability_px=_compute_repeatability_px(visits),
         gaps=gaps,
     )
 
 
-def _gaps(visits: list[_Visit]) -> Iterator[BranchDifference]:
+def _compute_branch_differences(visits: list[_Visit]) -> Iterator[BranchDifference]:
     """By set-point, the mean of the visits from below minus that of the visits from above."""
     for chamber_degC in sorted({visit.chamber_degC for visit in visits}):
         sides = [
@@ -133,10 +133,10 @@ def _gaps(visits: list[_Visit]) -> Iterator[BranchDifference]:
         if all(sides):
             up, down = (np.mean([visit.place_px for visit in side], axis=0) for side in sides)
             variance = sum(np.sum([visit.variance_px2 for visit in side], axis=0) / len(side) ** 2 for side in sides)
-            yield _gap(chamber_degC, up - down, np.asarray(variance))
+            yield _make_branch_difference(chamber_degC, up - down, np.asarray(variance))
 
 
-def _gap(chamber_degC: float, difference: Float, variance: Float) -> BranchDifference:
+def _make_branch_difference(chamber_degC: float, difference: Float, variance: Float) -> BranchDifference:
     seen: NDArray[np.bool_] = np.isfinite(difference[:, 0])
     return BranchDifference(
         chamber_degC=chamber_degC,
@@ -146,7 +146,7 @@ def _gap(chamber_degC: float, difference: Float, variance: Float) -> BranchDiffe
     )
 
 
-def _repeatability_px(visits: list[_Visit]) -> Float:
+def _compute_repeatability_px(visits: list[_Visit]) -> Float:
     """From the differences of all pairs of visits of the same set-point from the same side."""
     pairs = [
         np.nanmean(one.place_px - other.place_px, axis=0)

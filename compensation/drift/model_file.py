@@ -17,25 +17,25 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, Ty
 
 from thermostand.compensation.drift.candidates import Candidate, Pair
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.facts import Bump, ModelFacts
 from thermostand.compensation.drift.hull import is_area
-from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel, exponents
-from thermostand.compensation.drift.terms import MOTIONS, Term, term_of
-from thermostand.compensation.drift.thermal_model import BetweenNights, ThermalModel, ThermalRange
+from thermostand.compensation.drift.model_facts import Bump, ModelFacts
+from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel, list_exponents
+from thermostand.compensation.drift.terms import MOTIONS, Term, parse_term
+from thermostand.compensation.drift.thermal_model import BetweenSessions, ThermalModel, ThermalRange
 from thermostand.compensation.drift_runtime import HOTTEST_degC
-from thermostand.compensation.sound_values import (
+from thermostand.compensation.value_checks import (
     Degrees,
     Hull,
     NotNegative,
     Size,
     check_covariance,
     check_order,
+    check_shape,
     check_terms,
     check_within_image,
-    shaped,
 )
 from thermostand.foundation.documents import Document, load_json
-from thermostand.foundation.files import write_whole
+from thermostand.foundation.files import write_atomically
 
 FORMAT = "thermostand drift model"
 SCHEMA_VERSION = 10
@@ -50,7 +50,7 @@ Range = tuple[Degrees, Degrees]
 Rows = tuple[tuple[float, ...], ...]
 
 
-def _known(version: int) -> int:
+def _check_version(version: int) -> int:
     if version < SCHEMA_VERSION:
         raise ValueError(f"{version} is of an earlier, unreleased version of thermostand; fit the model anew")
     if version > SCHEMA_VERSION:
@@ -62,7 +62,7 @@ class _File(Document):
     """What the files of all forms have."""
 
     format: Literal["thermostand drift model"] = FORMAT
-    schema_version: Annotated[int, AfterValidator(_known)] = SCHEMA_VERSION
+    schema_version: Annotated[int, AfterValidator(_check_version)] = SCHEMA_VERSION
     software_version: str
     camera_serial: str
     session_ids: tuple[str, ...]
@@ -90,12 +90,12 @@ class PaperFile(_File):
     other: ThermalFile | None = None
 
 
-def _written(term: Term) -> dict[str, object]:
+def _serialise_term(term: Term) -> dict[str, object]:
     """Its kind and parameters, as terms.term_of takes them."""
     return {"kind": term.kind, **term.model_dump()}
 
 
-_Term = Annotated[Term, BeforeValidator(term_of), PlainSerializer(_written)]
+_Term = Annotated[Term, BeforeValidator(parse_term), PlainSerializer(_serialise_term)]
 
 
 class ThermalFile(_File):
@@ -128,20 +128,20 @@ _ANY: TypeAdapter[PaperFile | ThermalFile] = TypeAdapter(
 
 def save_model(model: DriftModel, path: Path | str) -> None:
     """Write the model as JSON, whole or not at all; SessionError when the place refuses."""
-    write_whole(Path(path), _document(model).model_dump_json(indent=1) + "\n")
+    write_atomically(Path(path), _build_document(model).model_dump_json(indent=1) + "\n")
 
 
 def load_model(path: Path | str) -> DriftModel:
     """The model in a file that `save_model` wrote, number for number; SessionError when it is anything else."""
-    return load_json(path, lambda text: _model(_ANY.validate_json(text, strict=True)), "a drift model")
+    return load_json(path, lambda text: _build_model(_ANY.validate_json(text, strict=True)), "a drift model")
 
 
-def _model(file: PaperFile | ThermalFile) -> DriftModel:
+def _build_model(file: PaperFile | ThermalFile) -> DriftModel:
     """With its other form; ValueError when its parts, or the two, do not fit together."""
-    model = _paper(file) if isinstance(file, PaperFile) else _thermal(file)
+    model = _build_paper_model(file) if isinstance(file, PaperFile) else _build_thermal_model(file)
     if file.other is None:
         return model
-    other = _model(file.other)
+    other = _build_model(file.other)
     if other.other is not None:
         raise ValueError("other: has another form itself")
     for name in ("camera_serial", "session_ids", "target_name", "image_size"):
@@ -150,7 +150,7 @@ def _model(file: PaperFile | ThermalFile) -> DriftModel:
     return replace(model, other=other)
 
 
-def _document(model: DriftModel) -> PaperFile | ThermalFile:
+def _build_document(model: DriftModel) -> PaperFile | ThermalFile:
     facts = model.facts
     common = {
         **{name: getattr(facts, name) for name in _FACTS},
@@ -159,28 +159,28 @@ def _document(model: DriftModel) -> PaperFile | ThermalFile:
         "hull_px": facts.hull_px.tolist(),
         "discrepancy_px": model.discrepancy_px.tolist(),
         "candidates": model.candidates,
-        "other": None if model.other is None else _document(model.other),
+        "other": None if model.other is None else _build_document(model.other),
     }
     match model:
         case PaperModel():
-            return PaperFile.model_validate({**common, **_paper_fields(model)})
+            return PaperFile.model_validate({**common, **_list_paper_fields(model)})
         case ThermalModel():
-            return ThermalFile.model_validate({**common, **_thermal_fields(model)})
+            return ThermalFile.model_validate({**common, **_list_thermal_fields(model)})
         case _:
             raise TypeError(f"no file form for a model of form {model.form}")
 
 
-def _paper_fields(model: PaperModel) -> dict[str, object]:
+def _list_paper_fields(model: PaperModel) -> dict[str, object]:
     return {
         "degree": model.degree,
-        "terms_abc": exponents(model.degree),
+        "terms_abc": list_exponents(model.degree),
         "coefficients_px": model.coefficients.tolist(),
         "coefficient_covariance_px2": model.coefficient_covariance.tolist(),
         "scores": model.scores,
     }
 
 
-def _thermal_fields(model: ThermalModel) -> dict[str, object]:
+def _list_thermal_fields(model: ThermalModel) -> dict[str, object]:
     return {
         "terms": model.terms,
         "reference_ambient_degC": model.reference_ambient_degC,
@@ -199,19 +199,19 @@ def _thermal_fields(model: ThermalModel) -> dict[str, object]:
     }
 
 
-def _paper(file: PaperFile) -> PaperModel:
+def _build_paper_model(file: PaperFile) -> PaperModel:
     """The model of a file; ValueError when its parts do not fit together."""
-    count = len(exponents(file.degree))
-    if list(file.terms_abc) != exponents(file.degree):
+    count = len(list_exponents(file.degree))
+    if list(file.terms_abc) != list_exponents(file.degree):
         raise ValueError(f"terms_abc: not the {count} terms of degree {file.degree}, in order")
     if file.degree not in {score.degree for score in file.scores}:
         raise ValueError(f"scores: none for degree {file.degree}")
-    coefficients = shaped("coefficients_px", file.coefficients_px, (2, count))
-    covariance = shaped("coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count))
+    coefficients = check_shape("coefficients_px", file.coefficients_px, (2, count))
+    covariance = check_shape("coefficient_covariance_px2", file.coefficient_covariance_px2, (2, count, count))
     check_terms("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
     check_covariance("coefficient_covariance_px2", covariance)
     model = PaperModel(
-        facts=_facts(file),
+        facts=_build_facts(file),
         degree=file.degree,
         coefficients=coefficients,
         coefficient_covariance=covariance,
@@ -224,14 +224,14 @@ def _paper(file: PaperFile) -> PaperModel:
     return model
 
 
-def _thermal(file: ThermalFile) -> ThermalModel:
+def _build_thermal_model(file: ThermalFile) -> ThermalModel:
     """The model of a file; ValueError when its parts do not fit together."""
     count = len(file.terms)
-    rows = shaped("coefficient_covariance_px2", file.coefficient_covariance_px2, (MOTIONS * count, count))
+    rows = check_shape("coefficient_covariance_px2", file.coefficient_covariance_px2, (MOTIONS * count, count))
     covariance = rows.reshape(MOTIONS, count, count)
-    leverage_matrix = shaped("leverage_matrix_px2", file.leverage_matrix_px2, (count, count))
-    reference_features = shaped("reference_features", file.reference_features, (count,))
-    coefficients = shaped("coefficients_px", file.coefficients_px, (MOTIONS, count))
+    leverage_matrix = check_shape("leverage_matrix_px2", file.leverage_matrix_px2, (count, count))
+    reference_features = check_shape("reference_features", file.reference_features, (count,))
+    coefficients = check_shape("coefficients_px", file.coefficients_px, (MOTIONS, count))
     # Features are about 1 at 20 K from the reference, motions at the image's edge.
     check_terms("coefficients_px", np.abs(coefficients).sum(axis=1), file.image_size_px)
     check_within_image("reference_features", coefficients @ reference_features, file.image_size_px)
@@ -239,7 +239,7 @@ def _thermal(file: ThermalFile) -> ThermalModel:
     check_covariance("leverage_matrix_px2", leverage_matrix)
     check_order("ambient_range_degC", file.ambient_range_degC)
     return ThermalModel(
-        facts=_facts(file),
+        facts=_build_facts(file),
         terms=file.terms,
         reference_ambient_degC=file.reference_ambient_degC,
         self_heating_K=file.self_heating_K,
@@ -258,11 +258,11 @@ def _thermal(file: ThermalFile) -> ThermalModel:
         candidates=file.candidates,
         between_nights=None
         if file.between_nights_px is None
-        else BetweenNights(file.between_nights_px, file.nights_compared),
+        else BetweenSessions(file.between_nights_px, file.nights_compared),
     )
 
 
-def _facts(file: PaperFile | ThermalFile) -> ModelFacts:
+def _build_facts(file: PaperFile | ThermalFile) -> ModelFacts:
     if not file.camera_range_degC[0] < file.camera_range_degC[1]:
         raise ValueError("camera_range_degC: not low, high")
     hull_px = np.array(file.hull_px)

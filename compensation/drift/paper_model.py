@@ -20,24 +20,24 @@ from pydantic import Field, model_validator
 from thermostand.compensation.drift.candidates import (
     Candidate,
     Pair,
-    as_good_as_best,
+    average_folds,
     check_folds,
-    discrepancy_px,
-    fold_means,
-    pair_of,
+    compute_discrepancy_px,
+    list_equivalent_to_best,
+    make_pair,
 )
-from thermostand.compensation.drift.displacements import Displacements, displacements
+from thermostand.compensation.drift.displacements import Displacements, compute_displacements
 from thermostand.compensation.drift.drift_model import (
     DriftModel,
     Flags,
     Outside,
     Situation,
-    place_flags,
-    range_flags,
-    states_of,
+    broadcast_states,
+    compute_place_flags,
+    compute_range_flags,
 )
-from thermostand.compensation.drift.facts import facts_of
-from thermostand.compensation.history.thermal_history import ThermalMemory
+from thermostand.compensation.drift.model_facts import collect_facts
+from thermostand.compensation.history.thermal_history import ThermalStateSpec
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 from thermostand.foundation.documents import Document
@@ -67,16 +67,16 @@ class Scaling:
         )
 
 
-def exponents(degree: int) -> list[tuple[int, int, int]]:
+def list_exponents(degree: int) -> list[tuple[int, int, int]]:
     """The (a, b, c) of the terms, in the order of the coefficients; (n+1)(n+2)(n+3)/6 of them."""
     numbers = range(degree + 1)
     return [(a, b, c) for a in numbers for b in numbers for c in numbers if a + b + c <= degree]
 
 
-def design(xy_px: Float, camera_degC: Float, degree: int, scaling: Scaling) -> Float:
+def build_design_matrix(xy_px: Float, camera_degC: Float, degree: int, scaling: Scaling) -> Float:
     """The terms (M, K) at centres (M, 2) and temperatures (M,)."""
     i, j, t = (chebyshev.chebvander(values, degree) for values in scaling.scale(xy_px, camera_degC))
-    a, b, c = np.array(exponents(degree)).T
+    a, b, c = np.array(list_exponents(degree)).T
     return i[:, a] * j[:, b] * t[:, c]
 
 
@@ -97,13 +97,13 @@ def condense(terms: Float, values: Float, variance: Float) -> Float:
     """Rows [terms | values] (M, K + 1) with variances (M,) as a triangle of at most K + 1 rows that gives the same fit:
     the R of their weighted QR. So each group of rows is worked through once, however often it is then left out."""
     weight = 1 / np.sqrt(variance)
-    return _triangle(np.column_stack([terms, values]) * weight[:, None])
+    return _triangularise(np.column_stack([terms, values]) * weight[:, None])
 
 
 def solve(triangles: Sequence[Float], count: int) -> PolynomialFit:
     """The fit of all the rows, `count` of them, that were condensed into the triangles; raises LinAlgError when they
     do not determine it."""
-    r = _triangle(np.concatenate(triangles))
+    r = _triangularise(np.concatenate(triangles))
     terms = r.shape[1] - 1
     if min(count, len(r)) < terms:
         raise np.linalg.LinAlgError(f"{count} values for {terms} terms")
@@ -119,7 +119,7 @@ def solve(triangles: Sequence[Float], count: int) -> PolynomialFit:
     )
 
 
-def _triangle(rows: Float) -> Float:
+def _triangularise(rows: Float) -> Float:
     return cast(Float, np.linalg.qr(rows, mode="r"))  # for this mode numpy's stubs promise a pair
 
 
@@ -142,7 +142,7 @@ class DegreeScore(Document):
     fold_rms_px: tuple[Pair, ...]
 
     @model_validator(mode="after")
-    def _fits_together(self) -> DegreeScore:
+    def _check_consistent(self) -> DegreeScore:
         check_folds(self.fold_chamber_degC, self.fold_rms_px)
         return self
 
@@ -159,9 +159,9 @@ class PaperModel(DriftModel):
     scores: tuple[DegreeScore, ...]
 
     @property
-    def memory(self) -> ThermalMemory:
+    def memory(self) -> ThermalStateSpec:
         """It needs nothing remembered."""
-        return ThermalMemory()
+        return ThermalStateSpec()
 
     @property
     def scaling(self) -> Scaling:
@@ -175,28 +175,28 @@ class PaperModel(DriftModel):
 
     def shift(self, xy_px: Float, state: Situation) -> Float:
         """As in DriftModel."""
-        return self._terms(xy_px, state) @ self.coefficients.T
+        return self._build_terms(xy_px, state) @ self.coefficients.T
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """A (A' W A)^-1 A' + s^2."""
-        terms = self._terms(xy_px, state)
+        terms = self._build_terms(xy_px, state)
         variance = np.einsum("nk,ckl,nl->nc", terms, self.coefficient_covariance, terms) + self.discrepancy_px**2
         return variance[:, :, None] * np.eye(2)
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """PLACE and CAMERA."""
-        camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
-        found = place_flags(xy_px, self.facts.hull_px)
-        return found | range_flags(camera_degC, self.facts.camera_range_degC, Outside.CAMERA)
+        camera_degC = broadcast_states(state, len(xy_px), self.memory).camera_degC
+        found = compute_place_flags(xy_px, self.facts.hull_px)
+        return found | compute_range_flags(camera_degC, self.facts.camera_range_degC, Outside.CAMERA)
 
     @property
     def score(self) -> DegreeScore:
         """The cross-validation of the degree in use."""
         return next(score for score in self.scores if score.degree == self.degree)
 
-    def _terms(self, xy_px: Float, state: Situation) -> Float:
-        camera_degC = states_of(state, len(xy_px), self.memory).camera_degC
-        return design(xy_px, camera_degC, self.degree, self.scaling)
+    def _build_terms(self, xy_px: Float, state: Situation) -> Float:
+        camera_degC = broadcast_states(state, len(xy_px), self.memory).camera_degC
+        return build_design_matrix(xy_px, camera_degC, self.degree, self.scaling)
 
 
 # The paper's polynomial: choose its degree by temperatures left out, fit it, and say how far it can be trusted.
@@ -212,21 +212,21 @@ def fit_paper(observations: Observations, degree: int | None = None) -> PaperMod
     SessionError when the sessions cannot support it.
     """
     frames = observations.of(Role.REFERENCE, Role.FIT)
-    rows = displacements(observations, frames)
-    scaling = scaling_of(observations, rows)
-    scores = cross_validate(rows, scaling, degrees_for(rows, degree))
-    chosen = choose(scores) if degree is None else _given(scores, degree)
-    solutions = _solutions(_condensed(rows, chosen, scaling))
-    held_out = left_out(rows, chosen, scaling)
+    rows = compute_displacements(observations, frames)
+    scaling = make_scaling(observations, rows)
+    scores = cross_validate(rows, scaling, list_degrees(rows, degree))
+    chosen = choose_degree(scores) if degree is None else _check_determined(scores, degree)
+    solutions = _solve_folds(_condense_folds(rows, chosen, scaling))
+    held_out = compute_left_out_residuals(rows, chosen, scaling)
     reference_degC = float(observations.camera_degC[observations.of(Role.REFERENCE)].mean())
     return PaperModel(
-        facts=facts_of(observations, rows, scaling.camera_degC, reference_degC),
+        facts=collect_facts(observations, rows, scaling.camera_degC, reference_degC),
         degree=chosen,
         coefficients=np.array([solution.coefficients for solution in solutions]),
         coefficient_covariance=np.array([solution.covariance for solution in solutions]),
-        discrepancy_px=discrepancy_px(rows, held_out),
+        discrepancy_px=compute_discrepancy_px(rows, held_out),
         scores=scores,
-        candidates=candidates_of(scores, chosen),
+        candidates=list_candidates(scores, chosen),
     )
 
 
@@ -236,7 +236,7 @@ def check_degree(degree: int | None) -> None:
         raise ConfigError(f"the degree is 1 to {MAX_DEGREE}, not {degree}")
 
 
-def degrees_for(rows: Displacements, degree: int | None) -> range:
+def list_degrees(rows: Displacements, degree: int | None) -> range:
     """The degrees that the temperatures can decide on: T^n needs n + 1 of them, and one more to be left out.
 
     SessionError when `degree` (None: any at all) is not among them.
@@ -254,7 +254,7 @@ def degrees_for(rows: Displacements, degree: int | None) -> range:
     return range(1, min(MAX_DEGREE, len(set_points) - 2) + 1)
 
 
-def scaling_of(observations: Observations, rows: Displacements) -> Scaling:
+def make_scaling(observations: Observations, rows: Displacements) -> Scaling:
     """The image and the range of the camera's temperature in these rows; SessionError when that hardly changes."""
     if len(rows.frame) == 0:
         raise SessionError(
@@ -272,7 +272,7 @@ def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tup
     scores: list[DegreeScore] = []
     for degree in degrees:
         try:
-            scores.append(_score(rows, degree, scaling))
+            scores.append(_score_degree(rows, degree, scaling))
         except np.linalg.LinAlgError:
             break
     if not scores:
@@ -280,29 +280,33 @@ def cross_validate(rows: Displacements, scaling: Scaling, degrees: range) -> tup
     return tuple(scores)
 
 
-def _score(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
-    squares = fold_means(rows, left_out(rows, degree, scaling) ** 2)
+def _score_degree(rows: Displacements, degree: int, scaling: Scaling) -> DegreeScore:
+    squares = average_folds(rows, compute_left_out_residuals(rows, degree, scaling) ** 2)
     return DegreeScore(
         degree=degree,
-        terms=len(exponents(degree)),
-        condition=max(solution.condition for solution in _solutions(_condensed(rows, degree, scaling))),
-        rms_px=pair_of(np.sqrt(squares.mean(axis=0))),
+        terms=len(list_exponents(degree)),
+        condition=max(solution.condition for solution in _solve_folds(_condense_folds(rows, degree, scaling))),
+        rms_px=make_pair(np.sqrt(squares.mean(axis=0))),
         fold_chamber_degC=tuple(np.unique(rows.chamber_degC).tolist()),
-        fold_rms_px=tuple(map(pair_of, np.sqrt(squares))),
+        fold_rms_px=tuple(map(make_pair, np.sqrt(squares))),
     )
 
 
-def left_out(rows: Displacements, degree: int, scaling: Scaling, asked: Displacements | None = None) -> Float:
+def compute_left_out_residuals(
+    rows: Displacements, degree: int, scaling: Scaling, asked: Displacements | None = None
+) -> Float:
     """Residual displacement (M, 2) of each row that is asked for, by default the same, from a fit to the rows that has
     not seen its chamber set-point; where that is NaN, to all."""
     asked = rows if asked is None else asked
-    folds = _condensed(rows, degree, scaling)
+    folds = _condense_folds(rows, degree, scaling)
     residual = asked.displacement_px.copy()
     for chamber_degC in np.unique(asked.chamber_degC).tolist():
-        known = _solutions([fold for fold in folds if fold.chamber_degC != chamber_degC])
+        known = _solve_folds([fold for fold in folds if fold.chamber_degC != chamber_degC])
         here = np.isnan(asked.chamber_degC) if math.isnan(chamber_degC) else asked.chamber_degC == chamber_degC
         coefficients = np.stack([solution.coefficients for solution in known], axis=1)
-        residual[here] -= design(asked.measured_px[here], asked.camera_degC[here], degree, scaling) @ coefficients
+        residual[here] -= (
+            build_design_matrix(asked.measured_px[here], asked.camera_degC[here], degree, scaling) @ coefficients
+        )
     return residual
 
 
@@ -315,35 +319,35 @@ class _Fold:
     triangles: tuple[Float, Float]
 
 
-def _condensed(rows: Displacements, degree: int, scaling: Scaling) -> list[_Fold]:
+def _condense_folds(rows: Displacements, degree: int, scaling: Scaling) -> list[_Fold]:
     """All rows, a fold for each chamber set-point."""
     folds: list[_Fold] = []
     for chamber_degC in np.unique(rows.chamber_degC).tolist():
         here = rows.chamber_degC == chamber_degC
-        terms = design(rows.measured_px[here], rows.camera_degC[here], degree, scaling)
+        terms = build_design_matrix(rows.measured_px[here], rows.camera_degC[here], degree, scaling)
         values, variance = rows.displacement_px[here], rows.variance_px2[here]
         i, j = (condense(terms, values[:, axis], variance[:, axis]) for axis in (0, 1))
         folds.append(_Fold(chamber_degC, int(here.sum()), (i, j)))
     return folds
 
 
-def _solutions(folds: Sequence[_Fold]) -> list[PolynomialFit]:
+def _solve_folds(folds: Sequence[_Fold]) -> list[PolynomialFit]:
     """The fits of I and of J to all rows of the folds; LinAlgError when they do not determine them."""
     count = sum(fold.count for fold in folds)
     return [solve([fold.triangles[axis] for fold in folds], count) for axis in (0, 1)]
 
 
-def choose(scores: tuple[DegreeScore, ...]) -> int:
+def choose_degree(scores: tuple[DegreeScore, ...]) -> int:
     """The simplest degree whose held-out mean square is within one standard error of the best.
 
     The standard error is that of the difference, fold by fold: what is common to both (a set-point that is hard for
     every degree) does not count.
     """
     squares = [np.array([i**2 + j**2 for i, j in score.fold_rms_px]) for score in scores]
-    return scores[as_good_as_best(squares)[0]].degree
+    return scores[list_equivalent_to_best(squares)[0]].degree
 
 
-def candidates_of(scores: tuple[DegreeScore, ...], degree: int) -> tuple[Candidate, ...]:
+def list_candidates(scores: tuple[DegreeScore, ...], degree: int) -> tuple[Candidate, ...]:
     """The degrees as rows of the table of choice."""
     return tuple(
         Candidate(
@@ -359,7 +363,7 @@ def candidates_of(scores: tuple[DegreeScore, ...], degree: int) -> tuple[Candida
     )
 
 
-def _given(scores: tuple[DegreeScore, ...], degree: int) -> int:
+def _check_determined(scores: tuple[DegreeScore, ...], degree: int) -> int:
     if degree not in {score.degree for score in scores}:
         raise SessionError(f"the markers do not determine a polynomial of degree {degree}; at most {len(scores)}")
     return degree

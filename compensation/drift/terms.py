@@ -17,9 +17,19 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from thermostand.compensation.drift_runtime import compiled, remembered
-from thermostand.compensation.expression import AIR, CAMERA, Expression, Feature, Origin, away, in_words, lag, play
-from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
-from thermostand.foundation.document_faults import path_text
+from thermostand.compensation.expression import (
+    AIR,
+    CAMERA,
+    Expression,
+    Feature,
+    Origin,
+    away,
+    backlash,
+    format_words,
+    lag,
+)
+from thermostand.compensation.history.thermal_history import Float, States, ThermalStateSpec
+from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.documents import Document
 from thermostand.foundation.plugins import load_point
 
@@ -68,7 +78,7 @@ class Term(Document):
     @property
     def symbol(self) -> str:
         """Its feature in a formula."""
-        return in_words(self.feature)
+        return format_words(self.feature)
 
     @classmethod
     def usual(cls) -> Sequence[Term]:
@@ -86,7 +96,7 @@ class ConstantTerm(Term):
         return 1.0
 
 
-class OfCamera(Term):
+class CameraTerm(Term):
     """The camera's own temperature, which brings its self-heating with it: with lags of the supply instead, a warm-up
     in other air is predicted worse."""
 
@@ -97,7 +107,7 @@ class OfCamera(Term):
         return away(CAMERA)
 
 
-class OfCameraSquared(Term):
+class CameraSquaredTerm(Term):
     """Its square."""
 
     kind = "camera squared"
@@ -169,7 +179,7 @@ class AmbientLagCubed(AmbientLagSquared):
     power = 3
 
 
-class OfPlay(Term):
+class BacklashTerm(Term):
     """A dead zone in what follows the camera's temperature."""
 
     kind = "play"
@@ -178,14 +188,14 @@ class OfPlay(Term):
 
     @property
     def feature(self) -> Feature:
-        return away(play(CAMERA, self.radius_K))
+        return away(backlash(CAMERA, self.radius_K))
 
     @classmethod
     def usual(cls) -> Sequence[Term]:
         return tuple(cls(radius_K=radius_K) for radius_K in (3.0, 6.0, 10.0, 14.0))
 
 
-class OfPartPlay(Term):
+class HiddenBacklashTerm(Term):
     """Of a part between air and camera that nobody measures, as a mount: it follows both late, and has a share of the
     camera's excess over the air. A dead zone in a mount moves the image by where the mount came from, which is no play
     of the chip's temperature: switching on heats the chip by 15 K and the mount by 3."""
@@ -199,7 +209,7 @@ class OfPartPlay(Term):
     @property
     def feature(self) -> Feature:
         air, camera = lag(AIR, self.tau_s), lag(CAMERA, self.tau_s)
-        return away(play(air + self.share * (camera - air), self.radius_K))
+        return away(backlash(air + self.share * (camera - air), self.radius_K))
 
     @property
     def symbol(self) -> str:
@@ -213,14 +223,14 @@ class OfPartPlay(Term):
         return tuple(cls(radius_K=radius_K, tau_s=tau_s, share=share) for tau_s, share, radius_K in parts)
 
 
-def usual_terms() -> tuple[Term, ...]:
+def list_usual_terms() -> tuple[Term, ...]:
     """What a camera may be moved by: the terms of a fit. ConfigError where a package's cannot be loaded."""
     for point in entry_points(group=GROUP):
         load_point(point)
     return tuple(term for kind in TERMS.values() for term in kind.usual())
 
 
-def term_of(value: object) -> Term:
+def parse_term(value: object) -> Term:
     """The term of a model file; ValueError when there is none such."""
     if isinstance(value, Term):
         return value
@@ -236,25 +246,25 @@ def term_of(value: object) -> Term:
     try:
         return TERMS[kind].model_validate(given)
     except ValidationError as error:
-        raise ValueError("; ".join(f"{path_text(each['loc'])}: {each['msg']}" for each in error.errors())) from error
+        raise ValueError("; ".join(f"{format_path(each['loc'])}: {each['msg']}" for each in error.errors())) from error
 
 
-def memory_of(terms: Sequence[Term], self_heating_K: float) -> ThermalMemory:
+def build_state_spec(terms: Sequence[Term], self_heating_K: float) -> ThermalStateSpec:
     """What the terms need remembered, and a lag of the ambient in any case: its range is part of where a model holds,
     also where a warm-up has shown the camera at every temperature."""
     parts = remembered([term.feature for term in terms])
     quickest = () if any(part[:2] == ("lag", AIR) for part in parts) else (lag(AIR, _QUICK_S),)
-    return ThermalMemory((*parts, *quickest), self_heating_K)
+    return ThermalStateSpec((*parts, *quickest), self_heating_K)
 
 
-def features(states: States, these: Sequence[Feature], origin: Origin) -> Float:
+def compute_features(states: States, these: Sequence[Feature], origin: Origin) -> Float:
     """(F, H) of F instants and H features; all but the constant are near 0 in equilibrium at the reference."""
     count, columns = len(states.camera_degC), states.columns
-    values = [compiled(origin.bound(one), states.memory.at)(columns) for one in these]
+    values = [compiled(origin.bind(one), states.memory.at)(columns) for one in these]
     return np.stack([np.broadcast_to(np.asarray(one, np.float64), count) for one in values], axis=1)
 
 
-def motions(xy_px: Float, image_size: tuple[int, int]) -> Float:
+def compute_motions(xy_px: Float, image_size: tuple[int, int]) -> Float:
     """(N, 2, 8): what each motion does to points (N, 2), per unit of amount, px."""
     width, height = image_size
     x = (xy_px[:, 0] - (width - 1) / 2) / (width / 2)

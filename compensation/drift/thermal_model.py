@@ -2,7 +2,7 @@
 
 A function of the camera's temperature alone cannot distinguish a lens that is still warming from a warm one. This form
 uses the history of air, supply and own temperature, kept in first-order lags and plays.
-compensation/drift/thermal_learning.py makes the model.
+compensation/drift/thermal_fit.py makes the model.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from thermostand.compensation.drift.drift_model import (
     Flags,
     Outside,
     Situation,
-    place_flags,
-    range_flags,
-    states_of,
+    broadcast_states,
+    compute_place_flags,
+    compute_range_flags,
 )
-from thermostand.compensation.drift.terms import TERMS, Term, features, memory_of, motions
+from thermostand.compensation.drift.terms import TERMS, Term, build_state_spec, compute_features, compute_motions
 from thermostand.compensation.drift_runtime import SETTLED_TAUS, remembered
 from thermostand.compensation.expression import Origin
-from thermostand.compensation.history.thermal_history import Float, States, ThermalMemory
+from thermostand.compensation.history.thermal_history import Float, States, ThermalStateSpec
 
 # Instead of it 3 or 5 mpx for all, or a posterior 1.3 to 2 times as wide, were no better at the same width.
 _LEAST_PX, _OF_DISCREPANCY = 0.002, 0.8
@@ -35,13 +35,13 @@ _LEAST_PX, _OF_DISCREPANCY = 0.002, 0.8
 case. Chosen on presets 300 to 303 and 48 drawn cameras."""
 # On 56 pairs of development sessions 92.5 to 100 % of the unflagged answers hold in most cases, for 91.3 to 100 without
 # the prior. Where no sessions can be compared Student's factor is 1.42; half the weight makes it 2.2, twice 1.18.
-_PRIOR_NIGHTS = 4.0
+_PRIOR_SESSIONS = 4.0
 """The prior weighs as much as so many nights."""
 _SIGMA_95, _TAIL = 1.959964, 0.975
 
 
 @dataclass(frozen=True, slots=True)
-class BetweenNights:
+class BetweenSessions:
     """sigma_px: along I and J; 1.96 times it is half of the 95 % interval of what another night adds. nights: that were
     compared with others; 0: it was assumed, not measured."""
 
@@ -66,16 +66,16 @@ class BetweenNights:
         return f"nights repeat to {i:.1f} mpx (I) and {j:.1f} mpx (J), as {shown}"
 
 
-def between_nights(discrepancy_px: Float, left_px2: Float) -> BetweenNights:
+def estimate_between_sessions(discrepancy_px: Float, left_px2: Float) -> BetweenSessions:
     """discrepancy_px (2,): what is left at set-points left out, within nights. left_px2 (N, 2): mean square that is
     left of each of N nights by a fit of the others, noise taken off; (0, 2) where none can be compared."""
     nights = len(left_px2)
     assumed_px2 = _LEAST_PX**2 + (_OF_DISCREPANCY * discrepancy_px) ** 2
     measured_px2 = np.maximum(left_px2 - discrepancy_px**2, 0.0).sum(axis=0)
-    freedom = _PRIOR_NIGHTS + nights
-    variance_px2 = (_PRIOR_NIGHTS * assumed_px2 + measured_px2) / freedom
+    freedom = _PRIOR_SESSIONS + nights
+    variance_px2 = (_PRIOR_SESSIONS * assumed_px2 + measured_px2) / freedom
     i, j = (np.sqrt(variance_px2) * float(stdtrit(freedom, _TAIL)) / _SIGMA_95).tolist()
-    return BetweenNights((i, j), nights)
+    return BetweenSessions((i, j), nights)
 
 
 # Three times the variance of the least known state of the fit. Plays of parts are taken as known here: with their
@@ -120,18 +120,18 @@ class ThermalModel(DriftModel):
     leverage_matrix: Float
     valid: ThermalRange
     has_warm_up: bool
-    between_nights: BetweenNights | None = None
+    between_nights: BetweenSessions | None = None
 
     @property
     def title(self) -> str:
         """The form in words."""
         without = "" if self.has_warm_up else "; no warm-up was recorded"
-        return f"{form_name(self.terms)}, {self.coefficients.size} coefficients{without}"
+        return f"{format_form_name(self.terms)}, {self.coefficients.size} coefficients{without}"
 
     @property
-    def memory(self) -> ThermalMemory:
+    def memory(self) -> ThermalStateSpec:
         """What has to be remembered for it."""
-        return memory_of(self.terms, self.self_heating_K)
+        return build_state_spec(self.terms, self.self_heating_K)
 
     @property
     def origin(self) -> Origin:
@@ -140,18 +140,20 @@ class ThermalModel(DriftModel):
 
     def shift(self, xy_px: Float, state: Situation) -> Float:
         """As in DriftModel."""
-        amounts = self._features(state, len(xy_px)) @ self.coefficients.T
-        return np.einsum("nak,nk->na", motions(xy_px, self.facts.image_size), amounts)
+        amounts = self._compute_features(state, len(xy_px)) @ self.coefficients.T
+        return np.einsum("nak,nk->na", compute_motions(xy_px, self.facts.image_size), amounts)
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which
         know little of a state unlike those of the fit, and of what the form leaves unexplained. That was seen at
         set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit. On any
         night but those fitted: of these ask the model that `of_sessions` gives."""
-        found = self._features(state, len(xy_px))
-        moved = motions(xy_px, self.facts.image_size)
+        found = self._compute_features(state, len(xy_px))
+        moved = compute_motions(xy_px, self.facts.image_size)
         variance = np.einsum("nh,mhk,nk->nm", found, self.coefficient_covariance, found, optimize=True)
-        more = np.maximum(self.leverage(states_of(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0)
+        more = np.maximum(
+            self.compute_leverage(broadcast_states(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0
+        )
         of_coefficients = (moved * variance[:, None, :]) @ moved.transpose(0, 2, 1)
         unexplained = of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
         known = self.between_nights
@@ -164,8 +166,8 @@ class ThermalModel(DriftModel):
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside."""
-        states = states_of(state, len(xy_px), self.memory)
-        return place_flags(xy_px, self.facts.hull_px) | self._state_flags(states)
+        states = broadcast_states(state, len(xy_px), self.memory)
+        return compute_place_flags(xy_px, self.facts.hull_px) | self._compute_state_flags(states)
 
     @property
     def history_s(self) -> float:
@@ -173,52 +175,54 @@ class ThermalModel(DriftModel):
         longest_s = SETTLED_TAUS * self.memory.longest_s
         return longest_s if self.valid.history_s is None else min(self.valid.history_s, longest_s)
 
-    def leverage(self, state: States) -> Float:
+    def compute_leverage(self, state: States) -> Float:
         """(N,), px^2: how far a state is from those of the fit, in terms of what they determine (the diagonal of the
         hat matrix, with the scale of the covariance)."""
-        found = self._features(state, len(state.camera_degC))
+        found = self._compute_features(state, len(state.camera_degC))
         return np.einsum("nk,kl,nl->n", found, self.leverage_matrix, found)
 
-    def _features(self, state: Situation, count: int) -> Float:
-        states = states_of(state, count, self.memory)
-        return features(states, [term.feature for term in self.terms], self.origin) - self.reference_features
+    def _compute_features(self, state: Situation, count: int) -> Float:
+        states = broadcast_states(state, count, self.memory)
+        return compute_features(states, [term.feature for term in self.terms], self.origin) - self.reference_features
 
-    def _state_flags(self, states: States) -> Flags:
+    def _compute_state_flags(self, states: States) -> Flags:
         valid = self.valid
-        found = range_flags(states.camera_degC, _widened(self.facts.camera_range_degC), Outside.CAMERA)
-        found |= range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
+        found = compute_range_flags(states.camera_degC, _widen(self.facts.camera_range_degC), Outside.CAMERA)
+        found |= compute_range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
         (ambient_degC,) = states.of([self.memory.ambient_lag]).T
-        found |= range_flags(ambient_degC, _widened(valid.ambient_degC), Outside.AMBIENT)
+        found |= compute_range_flags(ambient_degC, _widen(valid.ambient_degC), Outside.AMBIENT)
         # By the leverage and not only by each range: at temperatures never fitted intervals cover 94 % where they
         # covered 79 (12 drawn cameras, 17 to 45 degC fitted, 10 to 52 asked).
-        found |= range_flags(self.leverage(states), (0.0, _MORE_LEVERAGE * valid.leverage), Outside.STATE)
+        found |= compute_range_flags(
+            self.compute_leverage(states), (0.0, _MORE_LEVERAGE * valid.leverage), Outside.STATE
+        )
         needed_s = self.history_s
-        return found | range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
+        return found | compute_range_flags(states.settled_s, (needed_s, np.inf), Outside.HISTORY)
 
 
-def _widened(limits: Pair) -> Pair:
+def _widen(limits: Pair) -> Pair:
     margin = _MARGIN * (limits[1] - limits[0])
     return limits[0] - margin, limits[1] + margin
 
 
-def form_name(terms: tuple[Term, ...]) -> str:
+def format_form_name(terms: tuple[Term, ...]) -> str:
     """`homography x (1, T, T^2), ambient lag 4 to 450 min, plays 3 to 14 K, plays of parts 1 to 4 K`."""
     kept = [term for term in terms if remembered([term.feature])]
     still = ", ".join(term.symbol for term in terms if term not in kept)
-    named = [_named(own) for kind in TERMS.values() if (own := [term for term in kept if type(term) is kind])]
+    named = [_format_terms(own) for kind in TERMS.values() if (own := [term for term in kept if type(term) is kind])]
     named.sort(key=lambda name: name.split()[0])
     return ", ".join([f"homography x ({still})", *named])
 
 
-def _named(terms: Sequence[Term]) -> str:
+def _format_terms(terms: Sequence[Term]) -> str:
     """Terms of one kind, with the range of its first parameter."""
     kind = type(terms[0])
     first = next(iter(kind.model_fields), "")
     unit, size = ("min", 60.0) if first.endswith("_s") else (first.rpartition("_")[2], 1.0)
     values = [getattr(term, first) / size for term in terms] if first else []
-    return f"{kind.title} {_extent(values)} {unit}" if values else kind.title
+    return f"{kind.title} {_format_extent(values)} {unit}" if values else kind.title
 
 
-def _extent(values: list[float]) -> str:
+def _format_extent(values: list[float]) -> str:
     low, high = min(values), max(values)
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"

@@ -17,10 +17,10 @@ import numpy as np
 
 import thermostand.markers.target
 from thermostand import markers
-from thermostand.compensation.finding.piece import FoundMarkers, Piece, frames_in_order
-from thermostand.compensation.finding.workers import Work, in_processes, in_turn, on_cluster
+from thermostand.compensation.finding.piece import FoundMarkers, Piece, list_frames_in_order
+from thermostand.compensation.finding.workers import Work, find_in_turn, make_cluster_work, make_process_work
 from thermostand.foundation.errors import ConfigError
-from thermostand.recording.format.records import FramePlace, frame_crcs
+from thermostand.recording.format.records import FramePlace, read_frame_crcs
 
 # Markers found once are kept, by the content they were found in: a copied or renamed session finds them, too.
 #
@@ -30,23 +30,23 @@ from thermostand.recording.format.records import FramePlace, frame_crcs
 # $XDG_CACHE_HOME/thermostand/markers, or ~/.cache; delete them at will.
 
 
-def cache_folder() -> Path:
+def get_cache_folder() -> Path:
     """Where found markers are kept."""
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "thermostand" / "markers"
 
 
-def key_of(piece: Piece, places: Sequence[FramePlace]) -> str:
+def compute_key(piece: Piece, places: Sequence[FramePlace]) -> str:
     """The name under which the piece's markers are kept; `places` are the frames of its segment. SessionError when it
     cannot be read."""
-    own = piece.places_of(places)
-    crcs = frame_crcs(piece.segment, own)
+    own = piece.select_places(places)
+    crcs = read_frame_crcs(piece.segment, own)
     frames = [(place.time_ns, place.chunk.length, crc) for place, crc in zip(own, crcs, strict=True)]
-    parts = (frames, piece.target.model_dump_json(), piece.noise, _program())
+    parts = (frames, piece.target.model_dump_json(), piece.noise, _hash_program())
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def kept(folder: Path, key: str) -> FoundMarkers | None:
+def load_markers(folder: Path, key: str) -> FoundMarkers | None:
     """What is kept under `key`; None when there is nothing, or nothing that can be read."""
     try:
         with (folder / f"{key}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -55,7 +55,7 @@ def kept(folder: Path, key: str) -> FoundMarkers | None:
         return None
 
 
-def keep(folder: Path, key: str, found: FoundMarkers) -> None:
+def save_markers(folder: Path, key: str, found: FoundMarkers) -> None:
     """Keep it, whole or not at all; a place that refuses costs the time of finding it again and nothing else."""
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def keep(folder: Path, key: str, found: FoundMarkers) -> None:
 
 
 @cache
-def _program() -> str:
+def _hash_program() -> str:
     """A hash of what finds markers: our own text and the version of OpenCV."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     (folder,) = markers.__path__
@@ -84,14 +84,14 @@ def _program() -> str:
 class Finder:
     """How markers are found. folder: of what is kept, None to keep nothing."""
 
-    work: Work = in_turn
+    work: Work = find_in_turn
     folder: Path | None = None
 
     def __call__(self, pieces: Sequence[Piece], report: Callable[[int], None]) -> list[FoundMarkers]:
         """The markers of each piece; `report` gets the number of frames done."""
-        places_in = cache(frames_in_order)
-        keys = ["" if self.folder is None else key_of(piece, places_in(piece.segment)) for piece in pieces]
-        results = [None if self.folder is None else kept(self.folder, key) for key in keys]
+        places_in = cache(list_frames_in_order)
+        keys = ["" if self.folder is None else compute_key(piece, places_in(piece.segment)) for piece in pieces]
+        results = [None if self.folder is None else load_markers(self.folder, key) for key in keys]
         missing = [index for index, result in enumerate(results) if result is None]
         done = sum(piece.frames for piece, result in zip(pieces, results, strict=True) if result is not None)
         report(done)
@@ -99,7 +99,7 @@ class Finder:
             index = missing[number]
             results[index] = found
             if self.folder is not None:
-                keep(self.folder, keys[index], found)
+                save_markers(self.folder, keys[index], found)
             done += pieces[index].frames
             report(done)
         return [result for result in results if result is not None]
@@ -111,5 +111,11 @@ def finder(workers: int = 1, cluster: str | None = None, *, use_cache: bool = Tr
         raise ConfigError(f"--workers is 1 or more, not {workers}")
     if cluster is not None and workers > 1:
         raise ConfigError("--workers and --cluster exclude each other")
-    work = on_cluster(cluster) if cluster is not None else in_processes(workers) if workers > 1 else in_turn
-    return Finder(work, cache_folder() if use_cache else None)
+    work = (
+        make_cluster_work(cluster)
+        if cluster is not None
+        else make_process_work(workers)
+        if workers > 1
+        else find_in_turn
+    )
+    return Finder(work, get_cache_folder() if use_cache else None)

@@ -17,22 +17,22 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.one_camera import channel_of
+from thermostand.compensation.camera_selection import find_channel
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.instants import local_text
+from thermostand.foundation.instants import format_local
 from thermostand.markers.detection import (
     Detection,
     DetectionError,
     Noise,
     detect,
     follow,
-    nothing_found,
-    rows_to_follow,
+    make_empty_detection,
+    predict_rows,
 )
 from thermostand.markers.target import Target
-from thermostand.recording.format.damage import naming
+from thermostand.recording.format.damage import name_file_in_errors
 from thermostand.recording.format.images import ImageArray, decode_image
-from thermostand.recording.format.records import FramePlace, frame_places, read_frame
+from thermostand.recording.format.records import FramePlace, list_frame_places, read_frame
 from thermostand.recording.reading.session import Session
 
 Float = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Piece:
     target: Target
     noise: Noise | None
 
-    def places_of(self, places: Sequence[FramePlace]) -> list[FramePlace]:
+    def select_places(self, places: Sequence[FramePlace]) -> list[FramePlace]:
         """Its own among the segment's frames, which are in order of time."""
         own = [place for place in places if place.meta.channel == self.channel]
         return own[self.first : self.first + self.frames]
@@ -79,14 +79,14 @@ class FoundMarkers:
     reason: NDArray[np.str_]
 
 
-def pieces_of(
+def split_into_pieces(
     session: Session, target: Target, noise: Noise | None = None, frames_per_piece: int = FRAMES_PER_PIECE
 ) -> list[Piece]:
     """All the frames of a session's (leading) camera: its segments in order, each in order of time."""
     pieces: list[Piece] = []
-    channel = channel_of(session)
+    channel = find_channel(session)
     for segment in session.frame_segments:
-        count = sum(place.meta.channel == channel for place in frame_places(segment))
+        count = sum(place.meta.channel == channel for place in list_frame_places(segment))
         for first in range(0, count, frames_per_piece):
             part = min(frames_per_piece, count - first)
             pieces.append(Piece(segment.resolve(), channel, first, part, target, noise))
@@ -95,17 +95,17 @@ def pieces_of(
 
 def find_markers(piece: Piece) -> FoundMarkers:
     """Find the target in every frame of the piece; SessionError, with the frame's time, for one that cannot be read."""
-    nothing = nothing_found(piece.target)
+    nothing = make_empty_detection(piece.target)
     rows: list[tuple[FramePlace, tuple[int, int], Detection, str]] = []
     previous: Detection | None = None
     image: ImageArray | None = None
-    for place in piece.places_of(frames_in_order(piece.segment)):
+    for place in piece.select_places(list_frames_in_order(piece.segment)):
         detection, reason = None, ""
-        before, image = image, _image(place)
+        before, image = image, _read_frame_image(place)
         if before is None or image.shape != before.shape:
             previous = None
         if previous is not None and image.dtype == np.uint8:  # of other depths only all pixels say how large one can be
-            wanted = rows_to_follow(previous, piece.target, len(image))
+            wanted = predict_rows(previous, piece.target, len(image))
             detection = follow(cast(NDArray[np.uint8], image), wanted, piece.target, previous, piece.noise)
         if detection is None:
             try:
@@ -130,29 +130,29 @@ def find_markers(piece: Piece) -> FoundMarkers:
     )
 
 
-def joined(parts: list[FoundMarkers]) -> FoundMarkers:
+def concatenate_markers(parts: list[FoundMarkers]) -> FoundMarkers:
     """The frames of several pieces of one session, in order of time."""
     order = np.argsort(np.concatenate([part.time_ns for part in parts]), kind="stable")
     names = [field.name for field in fields(FoundMarkers)]
     return FoundMarkers(**{name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names})
 
 
-def _image(place: FramePlace) -> ImageArray:
+def _read_frame_image(place: FramePlace) -> ImageArray:
     """Its pixels; SessionError, with the frame's time, when it cannot be read."""
-    with _naming(place):
+    with _name_frame_in_errors(place):
         return decode_image(read_frame(place).image)
 
 
 @contextmanager
-def _naming(place: FramePlace) -> Generator[None]:
+def _name_frame_in_errors(place: FramePlace) -> Generator[None]:
     """Errors say which frame it was."""
     try:
-        with naming(place.path):
+        with name_file_in_errors(place.path):
             yield
     except SessionError as error:
-        raise SessionError(f"{error}; this was the frame of {local_text(place.time_ns)}") from error
+        raise SessionError(f"{error}; this was the frame of {format_local(place.time_ns)}") from error
 
 
-def frames_in_order(segment: Path) -> list[FramePlace]:
+def list_frames_in_order(segment: Path) -> list[FramePlace]:
     """The segment's frames in order of time, of all cameras."""
-    return sorted(frame_places(segment), key=attrgetter("time_ns"))
+    return sorted(list_frame_places(segment), key=attrgetter("time_ns"))

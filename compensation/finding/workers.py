@@ -27,13 +27,13 @@ _TRIES = 3
 """A piece whose worker died so often has killed it: the machine is out of memory, or the file is poison."""
 
 
-def in_turn(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
+def find_in_turn(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
     """One piece after the other, in this process."""
     for index, piece in enumerate(pieces):
         yield index, find_markers(piece)
 
 
-def in_processes(workers: int) -> Work:
+def make_process_work(workers: int) -> Work:
     """So many processes, each with one thread. What a process that was killed had not finished is done again by
     another; SessionError when that does not help.
 
@@ -46,9 +46,9 @@ def in_processes(workers: int) -> Work:
         left, tries = set(range(len(pieces))), 0
         while left:
             before = len(left)
-            with TemporaryDirectory(prefix="thermostand-found-") as folder, pool(workers) as processes:
+            with TemporaryDirectory(prefix="thermostand-found-") as folder, open_pool(workers) as processes:
                 try:
-                    for index, found in _finished(processes, folder, pieces, sorted(left)):
+                    for index, found in _iterate_finished(processes, folder, pieces, sorted(left)):
                         left.discard(index)
                         yield index, found
                 except BrokenProcessPool as error:
@@ -62,7 +62,7 @@ def in_processes(workers: int) -> Work:
     return work
 
 
-def _finished(
+def _iterate_finished(
     processes: ProcessPoolExecutor, folder: str, pieces: Sequence[Piece], indices: Iterable[int]
 ) -> Iterator[tuple[int, FoundMarkers]]:
     """As they are finished, also those that were when the pool broke."""
@@ -96,18 +96,18 @@ def find_to_file(piece: Piece, folder: str) -> str:
 
 
 @contextmanager
-def pool(workers: int) -> Generator[ProcessPoolExecutor]:
+def open_pool(workers: int) -> Generator[ProcessPoolExecutor]:
     """Forked from a process of their own kind that has loaded what they need, once for all pools (a fork of this one
     would copy its threads' locks); what is not begun is dropped on any early way out."""
     context = multiprocessing.get_context("forkserver")
-    processes = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
+    processes = ProcessPoolExecutor(workers, mp_context=context, initializer=_initialise_worker)
     try:
         yield processes
     finally:
         processes.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin() -> None:
+def _initialise_worker() -> None:
     """One thread, and no longer than the process that gives the work: a pool tells nobody that its owner was killed."""
     cv2.setNumThreads(1)
     threading.Thread(target=_end_with_owner, daemon=True).start()
@@ -120,21 +120,21 @@ def _end_with_owner() -> None:
         os._exit(1)
 
 
-def on_cluster(address: str, wait_s: float = 10.0) -> Work:
+def make_cluster_work(address: str, wait_s: float = 10.0) -> Work:
     """The Dask cluster whose scheduler is at `address` (host:port); its workers must see the sessions' files under the
     same paths. ConfigError when Dask is missing or does not answer there."""
 
     def work(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
-        with _client(address, wait_s) as client:
+        with _connect(address, wait_s) as client:
             futures = [client.submit(find_markers, piece, pure=False, retries=_TRIES) for piece in pieces]
             index_of = {future.key: index for index, future in enumerate(futures)}
-            for future, found in _as_completed(futures, client.loop):
+            for future, found in _iterate_completed(futures, client.loop):
                 yield index_of[future.key], found
 
     return work
 
 
-def _client(address: str, wait_s: float) -> Any:
+def _connect(address: str, wait_s: float) -> Any:
     try:
         from distributed import Client
     except ImportError as error:
@@ -145,7 +145,7 @@ def _client(address: str, wait_s: float) -> Any:
         raise ConfigError(f"--cluster {address}: no Dask scheduler answers there ({error})") from error
 
 
-def _as_completed(futures: Any, loop: Any) -> Any:
+def _iterate_completed(futures: Any, loop: Any) -> Any:
     from distributed import as_completed
 
     return as_completed(futures, loop=loop, with_results=True)

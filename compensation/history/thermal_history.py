@@ -20,7 +20,7 @@ from thermostand.compensation.expression import AIR, POWER, lag
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepState
-from thermostand.recording.reading.interpolation import GAP_NS, interpolated
+from thermostand.recording.reading.interpolation import GAP_NS, interpolate
 from thermostand.recording.reading.session import Session
 
 # What a camera remembers of its thermal past, at many instants.
@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class ThermalMemory:
+class ThermalStateSpec:
     """What a model needs remembered: lags and plays (compensation/expression.py), each after those it is made of.
     self_heating_K: of a camera over the air that has been on for long."""
 
@@ -60,13 +60,13 @@ class States:
     """A camera's thermal state at F instants. rows (F, 3 + P + 2): camera, air and supply, the P lags and plays of
     `memory`, then on_s and settled_s. NaN where unknown."""
 
-    memory: ThermalMemory
+    memory: ThermalStateSpec
     rows: Float
 
     @classmethod
-    def at_degC(cls, camera_degC: float | Float, count: int, memory: ThermalMemory | None = None) -> States:
+    def at_degC(cls, camera_degC: float | Float, count: int, memory: ThermalStateSpec | None = None) -> States:
         """Nothing but the camera's temperature is known, one or (F,), at `count` instants."""
-        memory = memory or ThermalMemory()
+        memory = memory or ThermalStateSpec()
         rows = np.full((count, len(memory.at) + 2), np.nan)
         rows[:, 0] = camera_degC
         return cls(memory, rows)
@@ -101,12 +101,12 @@ class States:
         return States(self.memory, self.rows[rows])
 
 
-def state_of(memory: ThermalMemory) -> ThermalState:
+def make_initial_state(memory: ThermalStateSpec) -> ThermalState:
     """A camera's thermal state that remembers this, before its first sample."""
     return ThermalState(memory.parts, memory.self_heating_K)
 
 
-def row_of(state: ThermalState) -> Float:
+def read_state_row(state: ThermalState) -> Float:
     """The state now, a row of States; all NaN in a gap."""
     return np.array([*state.values, state.on_s, state.settled_s]) + (0.0 if state.begun else math.nan)
 
@@ -152,19 +152,23 @@ class ThermalHistory:
         return len(self.ambient_ns) > 1
 
 
-def recorded_history(session: Session, until_ns: int | None = None) -> ThermalHistory:
+def read_history(session: Session, until_ns: int | None = None) -> ThermalHistory:
     """What the session's telemetry has of it, to that instant or its end; a channel that was not recorded is empty."""
-    columns = (_good(session, _AMBIENT), _powered(session), _good(session, f"{session.camera}.temperature"))
-    ambient, powered, camera = columns if until_ns is None else (_until(column, until_ns) for column in columns)
-    return refined(ThermalHistory(*ambient, *powered, *camera))
+    columns = (
+        _read_good_values(session, _AMBIENT),
+        _read_supply(session),
+        _read_good_values(session, f"{session.camera}.temperature"),
+    )
+    ambient, powered, camera = columns if until_ns is None else (_cut_at(column, until_ns) for column in columns)
+    return refine_temperature(ThermalHistory(*ambient, *powered, *camera))
 
 
-def _until(column: tuple[TimesNs, Float], until_ns: int) -> tuple[TimesNs, Float]:
+def _cut_at(column: tuple[TimesNs, Float], until_ns: int) -> tuple[TimesNs, Float]:
     known = column[0] <= until_ns
     return column[0][known], column[1][known]
 
 
-def refined(history: ThermalHistory) -> ThermalHistory:
+def refine_temperature(history: ThermalHistory) -> ThermalHistory:
     """With the camera's temperature between the steps of its display.
 
     Many cameras show theirs in quarters of a degree, at which the image moves by several mpx. Where the display changes
@@ -172,16 +176,16 @@ def refined(history: ThermalHistory) -> ThermalHistory:
     fitted to all readings of the session, moved so that it goes through the two changes; the display is never
     overruled by more than half a step.
     """
-    step_K = _step_K(history.camera_degC)
+    step_K = _find_display_step_K(history.camera_degC)
     if step_K < _FINE_K or not history.has_ambient or len(history.camera_ns) < _FEWEST_READINGS:
         return history
     shown, seconds = history.camera_degC, (history.camera_ns - history.camera_ns[0]) / NS_PER_S
     lags = [lag(of, tau_s) for of in (AIR, POWER) for tau_s in _SHAPE_TAUS_S]
-    states = states_at(history, ThermalMemory(tuple(lags)), history.camera_ns, shown)
-    ambient = interpolated(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
+    states = compute_states_at(history, ThermalStateSpec(tuple(lags)), history.camera_ns, shown)
+    ambient = interpolate(history.ambient_ns, history.ambient_degC, history.camera_ns, GAP_NS)
     terms = np.column_stack([np.ones(len(shown)), ambient, states.of(lags)])
     known = np.isfinite(terms).all(axis=1)
-    shape = np.where(known, terms @ damped_least_squares(terms[known], shown[known]), shown)
+    shape = np.where(known, terms @ solve_damped_least_squares(terms[known], shown[known]), shown)
     changes = np.flatnonzero((np.diff(shown) != 0) & (np.diff(history.camera_ns) < _CHANGE_NS))
     if len(changes) == 0:
         return history
@@ -192,14 +196,14 @@ def refined(history: ThermalHistory) -> ThermalHistory:
     return replace(history, camera_degC=camera_degC, resolution_K=step_K)
 
 
-def _step_K(readings_degC: Float) -> float:
+def _find_display_step_K(readings_degC: Float) -> float:
     """The smallest difference between two readings that is not rounding; 0 without any."""
     steps = np.diff(np.unique(readings_degC))
     steps = steps[steps > _ROUNDING_K]
     return float(steps.min()) if len(steps) else 0.0
 
 
-def damped_least_squares(terms: Float, values: Float, ridge: float = _SHAPE_RIDGE) -> Float:
+def solve_damped_least_squares(terms: Float, values: Float, ridge: float = _SHAPE_RIDGE) -> Float:
     """(K,) of terms (M, K) and values (M,); what they do not determine is near 0, by a small part `ridge` of the mean
     square of the terms."""
     normal = terms.T @ terms
@@ -207,7 +211,7 @@ def damped_least_squares(terms: Float, values: Float, ridge: float = _SHAPE_RIDG
     return np.linalg.solve(damped, terms.T @ values)
 
 
-def _good(session: Session, channel: str) -> tuple[TimesNs, Float]:
+def _read_good_values(session: Session, channel: str) -> tuple[TimesNs, Float]:
     try:
         times_ns, values = session.believed(channel)
     except SessionError:
@@ -216,10 +220,10 @@ def _good(session: Session, channel: str) -> tuple[TimesNs, Float]:
     return times_ns[good], values[good]
 
 
-def _powered(session: Session) -> tuple[TimesNs, Float]:
+def _read_supply(session: Session) -> tuple[TimesNs, Float]:
     """The relay's readings, and the instants of the steps that switched it: between two readings lie seconds, in which
     a camera that has just been switched on drifts fastest."""
-    times_ns, values = _good(session, _POWER)
+    times_ns, values = _read_good_values(session, _POWER)
     switched = [
         (mark.time_ns, float(bool(mark.parameters.get("on"))))
         for mark in session.steps()
@@ -231,50 +235,52 @@ def _powered(session: Session) -> tuple[TimesNs, Float]:
     return times_ns[order], values[order]
 
 
-def states_at(history: ThermalHistory, memory: ThermalMemory, time_ns: TimesNs, camera_degC: Float) -> States:
+def compute_states_at(
+    history: ThermalHistory, memory: ThermalStateSpec, time_ns: TimesNs, camera_degC: Float
+) -> States:
     """The thermal states at instants (F,), ascending, ns, at which the camera had these temperatures (F,).
 
     Those that were asked for last are kept, since a fit and its report ask for the same several times: not to be
     written to.
     """
     times_ns, degC = np.asarray(time_ns, np.int64), np.asarray(camera_degC, np.float64)
-    return States(memory, _rows_at(history, memory, times_ns.tobytes(), degC.tobytes()))
+    return States(memory, _compute_rows(history, memory, times_ns.tobytes(), degC.tobytes()))
 
 
 # A fit asks for the same states twice and its report up to four times more; following them is a third of a fit.
 @lru_cache(maxsize=8)
-def _rows_at(history: ThermalHistory, memory: ThermalMemory, times: bytes, temperatures: bytes) -> Float:
+def _compute_rows(history: ThermalHistory, memory: ThermalStateSpec, times: bytes, temperatures: bytes) -> Float:
     time_ns, camera_degC = np.frombuffer(times, np.int64), np.frombuffer(temperatures, np.float64)
     rows = States.at_degC(camera_degC, len(time_ns), memory).rows
     if history.has_ambient and len(time_ns) and time_ns[-1] > history.ambient_ns[0]:
         begin_ns = int(history.ambient_ns[0])
         marks_ns = np.unique(np.concatenate([np.arange(begin_ns, int(time_ns[-1]) + 1, _STEP_NS), time_ns]))
         marks_ns = marks_ns[marks_ns >= begin_ns]
-        camera = _camera(history, marks_ns, time_ns, camera_degC)
-        inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_means(history, marks_ns), camera[1:]])
-        found = _followed(memory, inputs, np.minimum(np.searchsorted(marks_ns, time_ns), len(inputs)))
+        camera = _interpolate_camera(history, marks_ns, time_ns, camera_degC)
+        inputs = np.column_stack([np.diff(marks_ns) / NS_PER_S, *_average_between(history, marks_ns), camera[1:]])
+        found = _follow_samples(memory, inputs, np.minimum(np.searchsorted(marks_ns, time_ns), len(inputs)))
         rows = np.where(np.isfinite(found[:, :1]), found, rows)
     rows.flags.writeable = False
     return rows
 
 
-def _followed(memory: ThermalMemory, inputs: Float, after: NDArray[np.intp]) -> Float:
+def _follow_samples(memory: ThermalStateSpec, inputs: Float, after: NDArray[np.intp]) -> Float:
     """The state's row after so many (F,) of the samples (dt, ambient, power, camera); NaN after none."""
-    state, wanted = state_of(memory), set(after.tolist())
-    rows = {0: row_of(state)}
+    state, wanted = make_initial_state(memory), set(after.tolist())
+    rows = {0: read_state_row(state)}
     for number, sample in enumerate(inputs.tolist(), 1):
         # The run-time's own recursion: states of a whole session at once took 12 ms for 96, which a fit of 2.9 s does
         # not show.
         state.advance(*sample)
         if number in wanted:
-            rows[number] = row_of(state)
+            rows[number] = read_state_row(state)
     return np.array([rows[number] for number in after.tolist()])
 
 
-def _camera(history: ThermalHistory, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
+def _interpolate_camera(history: ThermalHistory, marks_ns: TimesNs, time_ns: TimesNs, camera_degC: Float) -> Float:
     """The camera's temperature at the marks, NaN where it is unknown: at the frames the one recorded with them, refined
     within the display's step by the whole record."""
-    camera = interpolated(history.camera_ns, history.camera_degC, marks_ns, GAP_NS)
+    camera = interpolate(history.camera_ns, history.camera_degC, marks_ns, GAP_NS)
     at = np.searchsorted(marks_ns, time_ns)
     shown = np.isfinite(camera_degC) & (time_ns >= marks_ns[0])
     known, half_K = camera[at[shown]], history.resolution_K / 2
@@ -283,14 +289,14 @@ def _camera(history: ThermalHistory, marks_ns: TimesNs, time_ns: TimesNs, camera
     return camera
 
 
-def _means(history: ThermalHistory, marks_ns: TimesNs) -> tuple[Float, Float]:
+def _average_between(history: ThermalHistory, marks_ns: TimesNs) -> tuple[Float, Float]:
     """Mean ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where the
     they are not recorded."""
-    ambient = interpolated(history.ambient_ns, history.ambient_degC, marks_ns, GAP_NS)
-    return (ambient[1:] + ambient[:-1]) / 2, _powered_share(history, marks_ns)
+    ambient = interpolate(history.ambient_ns, history.ambient_degC, marks_ns, GAP_NS)
+    return (ambient[1:] + ambient[:-1]) / 2, _compute_powered_share(history, marks_ns)
 
 
-def _powered_share(history: ThermalHistory, marks_ns: TimesNs) -> Float:
+def _compute_powered_share(history: ThermalHistory, marks_ns: TimesNs) -> Float:
     """Exact means of the supply. A camera that reports its temperature is on where the relay was not recorded."""
     if len(history.powered_ns) == 0:
         return np.ones(len(marks_ns) - 1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from thermostand.compensation.datasheet.details import Details
-from thermostand.foundation.documents import yaml_data
+from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
+from thermostand.foundation.documents import parse_yaml
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.events import DEVICE_IDENTITY
 from thermostand.markers.target import Target
@@ -23,13 +23,13 @@ _DEVICES = (
 )
 
 
-def equipment_of(session: Session) -> list[Line]:
+def list_equipment(session: Session) -> list[Line]:
     """Names and what belongs to them; only what is known."""
-    identities = [*_identities(session)]
-    return [*_exposure(session), *identities, *_stand(session, are_named=bool(identities))]
+    identities = [*_list_identities(session)]
+    return [*_list_exposure(session), *identities, *_list_stand_devices(session, are_named=bool(identities))]
 
 
-def _identities(session: Session) -> Iterator[Line]:
+def _list_identities(session: Session) -> Iterator[Line]:
     """What each device said of itself, or its register map of it, the last time; the camera of these frames first."""
     found: dict[str, dict[str, Any]] = {}
     for event in session.events():
@@ -37,15 +37,15 @@ def _identities(session: Session) -> Iterator[Line]:
             found[str(event.data["device"])] = dict(event.data)
     own = found.pop(session.camera, None)
     if own is not None:
-        yield "Camera", _identity(own)
+        yield "Camera", _format_identity(own)
         if own.get("lens"):
             yield "Lens in the stand's file", str(own["lens"])
     for name, data in found.items():
         if "lens" not in data:  # else it is another camera
-            yield f"Device {name.replace('_', ' ')}", _identity(data)
+            yield f"Device {name.replace('_', ' ')}", _format_identity(data)
 
 
-def _identity(data: dict[str, Any]) -> str:
+def _format_identity(data: dict[str, Any]) -> str:
     facts = (
         " ".join(str(data[key]) for key in ("vendor", "model") if data.get(key)),
         f"serial number {data['serial_number']}" if data.get("serial_number") else "",
@@ -54,27 +54,27 @@ def _identity(data: dict[str, Any]) -> str:
     return ", ".join(text for text in facts if text)
 
 
-def _exposure(session: Session) -> Iterator[Line]:
+def _list_exposure(session: Session) -> Iterator[Line]:
     metas = session.frame_metas()
     if not metas:
         return
     exposures = sorted({meta.exposure_s for meta in metas if meta.exposure_s > 0})
     if exposures:
-        yield "Exposure", _range(1e3 * exposures[0], 1e3 * exposures[-1], "ms")
+        yield "Exposure", _format_range(1e3 * exposures[0], 1e3 * exposures[-1], "ms")
     gains = sorted({meta.gain_dB for meta in metas if meta.gain_dB == meta.gain_dB})
     if gains:
-        yield "Gain", _range(gains[0], gains[-1], "dB")
+        yield "Gain", _format_range(gains[0], gains[-1], "dB")
 
 
-def _range(low: float, high: float, unit: str) -> str:
+def _format_range(low: float, high: float, unit: str) -> str:
     return f"{low:g} {unit}" if low == high else f"{low:g} to {high:g} {unit}"
 
 
-def _stand(session: Session, *, are_named: bool) -> Iterator[Line]:
+def _list_stand_devices(session: Session, *, are_named: bool) -> Iterator[Line]:
     """are_named: whether the devices have said what they are; else it is taken from the stand's file."""
     text = session.attachment("config.yaml")
     try:
-        data: Any = yaml_data(text or "", "config.yaml")
+        data: Any = parse_yaml(text or "", "config.yaml")
     except ConfigError:
         return
     if not isinstance(data, dict):
@@ -88,10 +88,10 @@ def _stand(session: Session, *, are_named: bool) -> Iterator[Line]:
             yield name, str(kind)
     thermometers = data.get("thermometers")
     if isinstance(thermometers, dict):
-        yield "Thermometer channels", ", ".join(_sensor(name, sensor) for name, sensor in thermometers.items())
+        yield "Thermometer channels", ", ".join(_describe_sensor(name, sensor) for name, sensor in thermometers.items())
 
 
-def _sensor(name: object, sensor: Any) -> str:
+def _describe_sensor(name: object, sensor: Any) -> str:
     """A sensor with what is known of its calibration, as the stand's file states it."""
     known = sensor if isinstance(sensor, dict) else {}
     certificate = " of ".join(str(known[key]) for key in ("certificate", "calibrated") if known.get(key))
@@ -101,13 +101,13 @@ def _sensor(name: object, sensor: Any) -> str:
     return f"{name} ({facts})" if facts else str(name)
 
 
-def stated(details: Details, target: Target) -> list[Line]:
+def list_stated_details(details: MeasurementDetails, target: Target) -> list[Line]:
     """What somebody has stated, and which of what a reader asks for nobody has."""
     distance = "" if details.working_distance_mm is None else f"target {details.working_distance_mm:g} mm away"
     rows = [
         ("Lens", ", ".join(text for text in (details.lens, details.aperture, distance) if text)),
         ("Mount", details.mount),
-        ("Target", _target(target)),
+        ("Target", _describe_target(target)),
         ("Target certificate", details.target_certificate),
         ("Thermometer certificate", details.thermometer_certificate),
         ("Places of the sensors", "; ".join(f"{name}: {place}" for name, place in details.sensor_positions.items())),
@@ -119,7 +119,7 @@ def stated(details: Details, target: Target) -> list[Line]:
     return [(name, text or NOT_STATED) for name, text in rows]
 
 
-def _target(target: Target) -> str:
+def _describe_target(target: Target) -> str:
     discs = f"{target.columns} x {target.rows} discs of {target.diameter_mm:g} mm, {target.pitch_mm:g} mm apart"
     text = f"{target.name}: {discs}"
     if target.cmm_mm is None:

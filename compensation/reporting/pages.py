@@ -23,13 +23,19 @@ from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.camera_file import CameraFile
 from thermostand.compensation.datasheet.datasheet import COVERAGE, Datasheet, MeasuredQuantity
 from thermostand.compensation.drift.drift_model import Outside
-from thermostand.compensation.drift.evaluation import improvement_percent
+from thermostand.compensation.drift.evaluation import compute_improvement_percent
 from thermostand.compensation.reporting.drawing import page_figures
-from thermostand.compensation.reporting.drawing.figures import Draw, one_by_one
-from thermostand.compensation.reporting.equipment import Line, stated
-from thermostand.compensation.reporting.numbers import compact, measured, percent, significant, typeset
+from thermostand.compensation.reporting.drawing.figures import Draw, render_in_turn
+from thermostand.compensation.reporting.equipment import Line, list_stated_details
+from thermostand.compensation.reporting.report_numbers import (
+    format_compact,
+    format_percent,
+    format_significant,
+    format_with_expanded_uncertainty,
+    typeset,
+)
 from thermostand.compensation.validation3d import document
-from thermostand.compensation.validation3d.document import flagged, reason_names, with_limit
+from thermostand.compensation.validation3d.document import describe_flags, format_with_limit, list_reason_names
 from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.foundation.errors import ConfigError
 
@@ -41,17 +47,17 @@ NamedFigure = tuple[str, Figure]
 _ROLLED_DEG = 1.0
 
 
-def page(
-    template: str, title: str, figures: Iterable[NamedFigure] = (), draw: Draw = one_by_one, **values: object
+def render_page(
+    template: str, title: str, figures: Iterable[NamedFigure] = (), draw: Draw = render_in_turn, **values: object
 ) -> str:
     """The page of a template as HTML text: of `values`, and `svg`, the figures by their names."""
     named = list(figures)
     svg = dict(zip((name for name, _ in named), draw([(figure, name) for name, figure in named]), strict=True))
-    return _environment().get_template(f"{template}.html.jinja").render(title=title, svg=svg, **values)
+    return _make_environment().get_template(f"{template}.html.jinja").render(title=title, svg=svg, **values)
 
 
 @cache
-def _environment() -> Environment:
+def _make_environment() -> Environment:
     made = Environment(
         loader=PackageLoader("thermostand.compensation", "reporting"),
         autoescape=True,
@@ -61,38 +67,38 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     made.filters.update(_FILTERS)
-    names: dict[str, Any] = {"paper": document, "flagged": flagged, "reasons": _reasons}
+    names: dict[str, Any] = {"paper": document, "flagged": describe_flags, "reasons": _list_reasons}
     made.globals.update(names)
     return made
 
 
-def mpx(value_px: float, digits: int = 1) -> str:
+def format_mpx(value_px: float, digits: int = 1) -> str:
     """A dash for what is not known."""
     return "–" if math.isnan(value_px) else f"{1e3 * value_px:z.{digits}f}"
 
 
-def utc(instant: str) -> str:
+def format_utc(instant: str) -> str:
     """ISO 8601 to what is read on a page."""
     return f"{instant[:16].replace('T', ' ')} UTC"
 
 
-def orientation(roll_deg: float) -> str:
+def format_orientation(roll_deg: float) -> str:
     """Of a camera, against the first one."""
     if math.isnan(roll_deg):
         return "camera"
     return "normal camera" if abs(roll_deg) < _ROLLED_DEG else f"camera rotated by {abs(roll_deg):z.1f}°"
 
 
-def _each(values: Iterable[float], spec: str, over: float = 1.0) -> list[str]:
+def _format_each(values: Iterable[float], spec: str, over: float = 1.0) -> list[str]:
     return [format(value / over, spec) if math.isfinite(value) else "-" for value in values]
 
 
-def _counts(found: Mapping[str, int], before: str = "", after: str = "") -> str:
+def _format_counts(found: Mapping[str, int], before: str = "", after: str = "") -> str:
     return ", ".join(f"{count} {name.replace(before, after) if before else name}" for name, count in found.items())
 
 
-def _reasons(validation: SpatialValidation) -> list[str]:
-    return reason_names(Outside(int(np.bitwise_or.reduce(validation.flags, axis=None))))
+def _list_reasons(validation: SpatialValidation) -> list[str]:
+    return list_reason_names(Outside(int(np.bitwise_or.reduce(validation.flags, axis=None))))
 
 
 _FILTERS: dict[str, Any] = {
@@ -100,25 +106,27 @@ _FILTERS: dict[str, Any] = {
     "known": lambda value, spec: format(value, spec) if math.isfinite(value) else "",
     "is_finite": math.isfinite,
     "fine": lambda value, limit, digits: f"{value:z.{digits + (value < limit)}f}",
-    "gain": lambda before, after, digits=1: percent(improvement_percent(before, after), digits),
-    "mpx": mpx,
-    "percent": percent,
-    "measured": lambda value, expanded: [*measured(value, expanded)],
-    "significant": significant,
+    "gain": lambda before, after, digits=1: format_percent(compute_improvement_percent(before, after), digits),
+    "mpx": format_mpx,
+    "percent": format_percent,
+    "measured": lambda value, expanded: [*format_with_expanded_uncertainty(value, expanded)],
+    "significant": format_significant,
     "typeset": typeset,
-    "compacts": lambda values, sigmas: [compact(*each) for each in zip(values.tolist(), sigmas.tolist(), strict=True)],
-    "utc": utc,
-    "orientation": orientation,
-    "counts": _counts,
-    "each": _each,
+    "compacts": lambda values, sigmas: [
+        format_compact(*each) for each in zip(values.tolist(), sigmas.tolist(), strict=True)
+    ],
+    "utc": format_utc,
+    "orientation": format_orientation,
+    "counts": _format_counts,
+    "each": _format_each,
     "times": lambda values, factor: [factor * value for value in values],
-    "limits": lambda values, sigmas: [with_limit(*each) for each in zip(values, sigmas, strict=True)],
+    "limits": lambda values, sigmas: [format_with_limit(*each) for each in zip(values, sigmas, strict=True)],
     "rms": lambda values: np.sqrt(np.nanmean(values**2, axis=0)),
     "mean": lambda values, axis=(0, 1): np.nanmean(values, axis=axis),
 }
 
 
-def pdf_of(html: str) -> bytes:
+def render_pdf(html: str) -> bytes:
     """A page as a PDF, by WeasyPrint: print rules of the page's own style sheet, no browser, no network. ConfigError
     when it, or the text library it draws with, is not installed."""
     try:
@@ -131,10 +139,10 @@ def pdf_of(html: str) -> bytes:
     # It reads figures' styles twice, once as if they were HTML's, and warns of each property.
     logging.getLogger("weasyprint").setLevel(logging.ERROR)
     # Nothing outside of the page is looked up: it has everything in it.
-    return bytes(weasyprint.HTML(string=html, url_fetcher=_refused).write_pdf())
+    return bytes(weasyprint.HTML(string=html, url_fetcher=_fetch_data_url).write_pdf())
 
 
-def _refused(url: str, *_: object, **__: object) -> Any:
+def _fetch_data_url(url: str, *_: object, **__: object) -> Any:
     if url.startswith("data:"):
         fetch: Any = importlib.import_module("weasyprint.urls").default_url_fetcher
         return fetch(url)
@@ -145,32 +153,32 @@ FORMAT = "thermostand datasheet 1"
 _LIBRARIES = ("thermostand", "numpy", "scipy", "opencv-python-headless")
 
 
-def datasheet_page(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
+def render_datasheet_page(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
     """As HTML text; the same data give the same text."""
     unknown: dict[str, list[str]] = {}
     for one in sheet.quantities:
         if one.why:
             unknown.setdefault(one.why, []).append(one.name)
-    return page(
+    return render_page(
         "datasheet",
         f"Thermal datasheet of camera {sheet.model.facts.camera_serial}",
-        _datasheet_figures(sheet),
+        _draw_datasheet_figures(sheet),
         sheet=sheet,
-        span=[_utc(ns) for ns in _span_ns(sheet)],
+        span=[_format_utc_ns(ns) for ns in _compute_span_ns(sheet)],
         groups=[(name, [*members]) for name, members in groupby(sheet.quantities, key=lambda one: one.group)],
         unknown=unknown,
-        measured_with=[*stated(sheet.details, sheet.observations.target), *equipment],
-        versions=", ".join(f"{name} {version}" for name, version in _versions().items()),
+        measured_with=[*list_stated_details(sheet.details, sheet.observations.target), *equipment],
+        versions=", ".join(f"{name} {version}" for name, version in _read_versions().items()),
     )
 
 
-def _datasheet_figures(sheet: Datasheet) -> Iterator[NamedFigure]:
-    yield "temperature", page_figures.over_temperature(sheet)
+def _draw_datasheet_figures(sheet: Datasheet) -> Iterator[NamedFigure]:
+    yield "temperature", page_figures.draw_over_temperature(sheet)
     if sheet.warming is not None:
-        yield "warm-up", page_figures.warm_up(sheet.warming, sheet.by_key["settling_s"].value)
+        yield "warm-up", page_figures.draw_warm_up(sheet.warming, sheet.by_key["settling_s"].value)
 
 
-def datasheet_json(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
+def serialise_datasheet(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
     """Every number of the page; what could not be measured is null, and `why` says so."""
     facts = sheet.model.facts
     document = {
@@ -178,28 +186,30 @@ def datasheet_json(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
         "camera": facts.camera_serial,
         "simulated": sheet.observations.simulated,
         "sessions": [one.session_id for one in sheet.observations.sessions],
-        "recorded": [_utc(one) for one in _span_ns(sheet)],
+        "recorded": [_format_utc_ns(one) for one in _compute_span_ns(sheet)],
         "coverage_factor": COVERAGE,
         "air_degC": sheet.air_degC,
         "camera_degC": sheet.camera_degC,
         "model": {"form": sheet.model.form, "title": sheet.model.title},
         "equipment": dict(equipment),
         "stated": sheet.details.model_dump(exclude_defaults=True),
-        "versions": _versions(),
-        "quantities": [_plain(one) for one in sheet.quantities],
-        "nights": [[_plain(one) for one in night] for night in sheet.nights] if len(sheet.nights) > 1 else [],
+        "versions": _read_versions(),
+        "quantities": [_serialise_quantity(one) for one in sheet.quantities],
+        "nights": [[_serialise_quantity(one) for one in night] for night in sheet.nights]
+        if len(sheet.nights) > 1
+        else [],
     }
     return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _plain(one: MeasuredQuantity) -> dict[str, object]:
+def _serialise_quantity(one: MeasuredQuantity) -> dict[str, object]:
     return {
         "key": one.key,
         "name": one.name,
         "unit": one.unit,
-        "value": _finite(one.value),
-        "standard_uncertainty": _finite(one.u),
-        "expanded_uncertainty": _finite(one.expanded),
+        "value": _none_if_not_finite(one.value),
+        "standard_uncertainty": _none_if_not_finite(one.u),
+        "expanded_uncertainty": _none_if_not_finite(one.expanded),
         "model": one.model,
         "why": one.why,
         "contributions": [
@@ -217,47 +227,47 @@ def _plain(one: MeasuredQuantity) -> dict[str, object]:
     }
 
 
-def _finite(value: float) -> float | None:
+def _none_if_not_finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _span_ns(sheet: Datasheet) -> tuple[int, int]:
+def _compute_span_ns(sheet: Datasheet) -> tuple[int, int]:
     observed = sheet.observations
     utc = [observed.sessions[index].utc for index in (observed.session[0], observed.session[-1])]
     return utc[0].utc_ns(int(observed.time_ns[0])), utc[1].utc_ns(int(observed.time_ns[-1]))
 
 
-def _utc(ns: int) -> str:
+def _format_utc_ns(ns: int) -> str:
     return f"{datetime.fromtimestamp(ns // 1_000_000_000, UTC):%Y-%m-%d %H:%M} UTC"
 
 
-def _versions() -> dict[str, str]:
+def _read_versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in _LIBRARIES}
 
 
-def calibration_page(file: CameraFile, calibration: CameraCalibration) -> str:
+def render_calibration_page(file: CameraFile, calibration: CameraCalibration) -> str:
     """As HTML text; the same data give the same text."""
     drawn = {
-        "residuals": page_figures.residual_vectors,
-        "sizes": page_figures.residual_sizes,
-        "histogram": page_figures.normalised_histogram,
-        "uncertainty": page_figures.uncertainty_map,
-        **({"scores": page_figures.model_scores} if calibration.scores else {}),
-        "rays": page_figures.rays_against_pinhole,
-        "corrections": page_figures.corrections,
+        "residuals": page_figures.draw_residual_vectors,
+        "sizes": page_figures.draw_residual_sizes,
+        "histogram": page_figures.draw_normalised_histogram,
+        "uncertainty": page_figures.draw_uncertainty_map,
+        **({"scores": page_figures.draw_model_scores} if calibration.scores else {}),
+        "rays": page_figures.draw_rays_against_pinhole,
+        "corrections": page_figures.draw_corrections,
     }
     figures = ((name, draw(calibration)) for name, draw in drawn.items())
-    return page("calibration", f"Calibration of camera {file.camera_serial}", figures, file=file)
+    return render_page("calibration", f"Calibration of camera {file.camera_serial}", figures, file=file)
 
 
-def validation_page(validation: SpatialValidation) -> str:
+def render_validation_page(validation: SpatialValidation) -> str:
     """As HTML text; the same validation gives the same text."""
     title = f"Validation of {validation.session_id} in three dimensions"
-    return page("validation", title, validation_figures(validation), validation=validation)
+    return render_page("validation", title, draw_validation_figures(validation), validation=validation)
 
 
-def validation_figures(validation: SpatialValidation) -> Iterator[NamedFigure]:
+def draw_validation_figures(validation: SpatialValidation) -> Iterator[NamedFigure]:
     """Of that page, and of a report's part."""
-    yield "bars", page_figures.deviation_bars(validation)
+    yield "bars", page_figures.draw_deviation_bars(validation)
     for number, one in enumerate(variant for variant in (validation.after, validation.with_stand) if variant):
-        yield f"positions-{number}", page_figures.by_position(validation, one)
+        yield f"positions-{number}", page_figures.draw_by_position(validation, one)

@@ -10,7 +10,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.drift.displacements import reference_centres
+from thermostand.compensation.drift.displacements import average_reference_centres
 from thermostand.compensation.observations import Float, Observations
 from thermostand.experiments.steps import Role
 
@@ -43,7 +43,7 @@ class Track:
     @property
     def mean_px(self) -> Float:
         """(F, 2): mean over the markers; NaN for a frame without any."""
-        return mean_over_markers(self.moved_px)
+        return average_over_markers(self.moved_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,13 +67,13 @@ class CycleVisit:
     direction: int
 
 
-def moved_px(observations: Observations) -> Float:
+def compute_displacement_px(observations: Observations) -> Float:
     """(F, N, 2): where each marker is, minus where it was at its session's reference, px.
 
     A session without reference frames, and a warm-up of a camera that had been rolled or moved before the reference,
     are compared with their own first frame that has the marker. NaN for frames that show the target elsewhere.
     """
-    origin = reference_centres(observations)[0]
+    origin = average_reference_centres(observations)[0]
     moved = np.full(observations.centres_px.shape, np.nan)
     shown = observations.of(*_AT_ONE_PLACE)
     for index in range(len(observations.sessions)):
@@ -81,13 +81,13 @@ def moved_px(observations: Observations) -> Float:
         if np.isfinite(origin[index]).any():
             moved[own] = observations.centres_px[own] - origin[index]
         elif own.any():
-            moved[own] = _from_own_first(observations.centres_px[own])[1]
+            moved[own] = _subtract_first(observations.centres_px[own])[1]
     for frame in np.flatnonzero(observations.of(Role.OTHER)):  # which may show the target anywhere
         if not _is_near(moved[frame]):
             moved[frame] = np.nan
-    for frames in _warm_up_frames(observations):
+    for frames in _find_warm_up_frames(observations):
         if not _is_near(moved[frames[0]]):
-            moved[frames] = _from_own_first(observations.centres_px[frames])[1]
+            moved[frames] = _subtract_first(observations.centres_px[frames])[1]
     return moved
 
 
@@ -98,36 +98,36 @@ def _is_near(moved: Float) -> bool:
     return len(lengths) > 0 and float(np.median(lengths)) < _ELSEWHERE_PX
 
 
-def _from_own_first(centres: Float) -> tuple[Float, Float]:
+def _subtract_first(centres: Float) -> tuple[Float, Float]:
     """(N, 2): the first place of each marker in (F, N, 2); and (F, N, 2): how far it is from there."""
     first = np.argmax(np.isfinite(centres).all(axis=2), axis=0)
     start = centres[first, np.arange(centres.shape[1])]
     return start, centres - start
 
 
-def warm_ups(observations: Observations) -> tuple[WarmUpTrack, ...]:
+def find_warm_ups(observations: Observations) -> tuple[WarmUpTrack, ...]:
     """Each warm-up, from its own first frame."""
-    return tuple(_warm_up(observations, frames) for frames in _warm_up_frames(observations))
+    return tuple(_make_warm_up_track(observations, frames) for frames in _find_warm_up_frames(observations))
 
 
-def _warm_up_frames(observations: Observations) -> Iterator[Rows]:
+def _find_warm_up_frames(observations: Observations) -> Iterator[Rows]:
     frames = np.flatnonzero(observations.of(Role.WARM_UP)).tolist()
     for _, group in groupby(frames, key=lambda k: (int(observations.session[k]), observations.step_id[k])):
         yield np.array(list(group), np.int64)
 
 
-def _warm_up(observations: Observations, frames: Rows) -> WarmUpTrack:
+def _make_warm_up_track(observations: Observations, frames: Rows) -> WarmUpTrack:
     session = int(observations.session[frames[0]])
-    start, moved = _from_own_first(observations.centres_px[frames])
+    start, moved = _subtract_first(observations.centres_px[frames])
     times_ns = observations.time_ns[frames]
-    on_ns = observations.switched_on_ns(session, int(times_ns[0]))
+    on_ns = observations.find_switch_on_ns(session, int(times_ns[0]))
     since_ns = times_ns - (int(times_ns[0]) if on_ns is None else on_ns)
-    at_reference = _is_near(start - reference_centres(observations)[0][session])
-    track = Track(session, frames, start, moved, _roll_deg(observations, start), at_reference)
+    at_reference = _is_near(start - average_reference_centres(observations)[0][session])
+    track = Track(session, frames, start, moved, _compute_roll_deg(observations, start), at_reference)
     return WarmUpTrack(track, since_ns / _NS_PER_S, on_ns is not None)
 
 
-def _roll_deg(observations: Observations, start_px: Float) -> float:
+def _compute_roll_deg(observations: Observations, start_px: Float) -> float:
     """From the directions between the same markers in the first usable frame and here."""
     first = observations.centres_px[int(np.argmax(observations.usable))]
     both = np.isfinite(first).all(axis=1) & np.isfinite(start_px).all(axis=1)
@@ -138,17 +138,19 @@ def _roll_deg(observations: Observations, start_px: Float) -> float:
     return math.degrees(math.atan2(cross, (before * now).sum()))
 
 
-def cycle(observations: Observations, session: int) -> Track | None:
+def find_cycle(observations: Observations, session: int) -> Track | None:
     """The thermal cycle of a session, from its reference; None when it has no more than that."""
     own = observations.session == session
     frames = np.flatnonzero(observations.of(*CYCLE) & own)
     if not (observations.of(Role.REFERENCE) & own).any() or not (observations.of(*CYCLE[1:]) & own).any():
         return None
-    start = reference_centres(observations)[0][session]
-    return Track(session, frames, start, observations.centres_px[frames] - start, _roll_deg(observations, start), True)
+    start = average_reference_centres(observations)[0][session]
+    return Track(
+        session, frames, start, observations.centres_px[frames] - start, _compute_roll_deg(observations, start), True
+    )
 
 
-def visits(observations: Observations, track: Track) -> tuple[CycleVisit, ...]:
+def list_visits(observations: Observations, track: Track) -> tuple[CycleVisit, ...]:
     """The set-points of a cycle in order of time."""
     found: list[CycleVisit] = []
     mean = track.mean_px
@@ -162,12 +164,12 @@ def visits(observations: Observations, track: Track) -> tuple[CycleVisit, ...]:
     return tuple(found)
 
 
-def mean_over_markers(values: Float) -> Float:
+def average_over_markers(values: Float) -> Float:
     """(F, 2) from (F, N, 2); NaN where a frame has no marker."""
     count = np.isfinite(values[:, :, 0]).sum(axis=1)
     return np.where(count[:, None] > 0, np.nansum(values, axis=1) / np.maximum(count, 1)[:, None], np.nan)
 
 
-def thinned(count: int, limit: int) -> Rows:
+def thin(count: int, limit: int) -> Rows:
     """At most `limit` of `count` places, evenly, with the first and the last."""
     return np.unique(np.round(np.linspace(0, count - 1, min(count, limit))).astype(np.int64))

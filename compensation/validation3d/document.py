@@ -17,7 +17,7 @@ from thermostand.compensation.observations import Float
 from thermostand.compensation.validation3d.validate import Deviations, SpatialValidation
 from thermostand.foundation.documents import Document, load_json
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.json_values import plain
+from thermostand.foundation.json_values import make_plain
 
 # What the paper reports (Sensors 2018, 18, 3685, section 7): figure 15's averages and Table 1, mm.
 
@@ -62,7 +62,7 @@ TABLE_1 = (
 )
 
 
-def summary(validation: SpatialValidation) -> str:
+def format_summary(validation: SpatialValidation) -> str:
     """Mean absolute deviation along X, Y, Z with its standard uncertainty, for every variant; rotation and table."""
     width = max(len(one.name) for one in validation.variants) + 2
     where = " (simulated)" if validation.simulated else ""
@@ -70,27 +70,27 @@ def summary(validation: SpatialValidation) -> str:
         f"mean absolute deviation of {', '.join(validation.names)} from {validation.chamber_degC[0]:g} degC over "
         f"{len(validation.chamber_degC) - 1} temperatures{where}, um",
         f"{'':<{width}}{'X':>17}{'Y':>17}{'Z':>17}",
-        _paper_line("paper, before", BEFORE_mm, width),
-        _paper_line("paper, after", AFTER_mm, width),
+        _format_paper_line("paper, before", BEFORE_mm, width),
+        _format_paper_line("paper, after", AFTER_mm, width),
     ]
     for one in validation.variants:
-        cells = (with_limit(value, u) for value, u in zip(one.mean_um, one.u_mean_um, strict=True))
+        cells = (format_with_limit(value, u) for value, u in zip(one.mean_um, one.u_mean_um, strict=True))
         lines.append(f"{one.name:<{width}}" + "".join(f"{cell:>17}" for cell in cells))
     table_um, rotation_mrad = validation.after.table_um, validation.after.mean_rotation_mrad
     lines += [
-        f"table repeatability from V0 seen again: {_triple(table_um)} um; "
-        f"rotation after compensation: {_triple(rotation_mrad, 3)} mrad",
-        flagged(validation),
+        f"table repeatability from V0 seen again: {_format_triple(table_um)} um; "
+        f"rotation after compensation: {_format_triple(rotation_mrad, 3)} mrad",
+        describe_flags(validation),
     ]
     return "\n".join(lines)
 
 
-def with_limit(value_um: float, u_um: float) -> str:
+def format_with_limit(value_um: float, u_um: float) -> str:
     """A mean absolute value, which is never below 0, so that no symmetrical interval belongs to it: 0.10 (u ≤ 0.69)."""
     return f"{value_um:.2f} (u ≤ {u_um:.2f})"
 
 
-def flagged(validation: SpatialValidation) -> str:
+def describe_flags(validation: SpatialValidation) -> str:
     """What of the corrections was beyond the model's valid range, and why."""
     reasons = Outside(int(np.bitwise_or.reduce(validation.flags[np.isfinite(validation.outside)], axis=None)))
     share = float(np.nanmean(validation.outside))
@@ -99,20 +99,20 @@ def flagged(validation: SpatialValidation) -> str:
     poses = int(np.count_nonzero(np.nan_to_num(validation.outside)))
     return (
         f"{share:.1%} of the corrections, at {poses} of {validation.outside.size} poses, are outside the drift model's "
-        f"valid range ({', '.join(reason_names(reasons))})"
+        f"valid range ({', '.join(list_reason_names(reasons))})"
     )
 
 
-def reason_names(flags: Outside) -> list[str]:
+def list_reason_names(flags: Outside) -> list[str]:
     """The reasons in a set of flags, in words."""
     return [(flag.name or "").lower().replace("_", " ") for flag in Outside if flag in flags]
 
 
-def _paper_line(name: str, values_mm: tuple[float, float, float], width: int) -> str:
+def _format_paper_line(name: str, values_mm: tuple[float, float, float], width: int) -> str:
     return f"{name:<{width}}" + "".join(f"{1e3 * value:>14.1f}" for value in values_mm)
 
 
-def _triple(values: Float, digits: int = 2) -> str:
+def _format_triple(values: Float, digits: int = 2) -> str:
     return " / ".join(f"{value:.{digits}f}" for value in values)
 
 
@@ -176,7 +176,7 @@ class _File(Document):
     results: Annotated[tuple[_Result, ...], Field(min_length=2, max_length=4)]
 
 
-def as_json(validation: SpatialValidation) -> str:
+def serialise_validation(validation: SpatialValidation) -> str:
     """The document's text."""
     places = zip(validation.names, validation.linear_mm, validation.rotary_deg, validation.distance_mm, strict=True)
     document = {
@@ -192,14 +192,14 @@ def as_json(validation: SpatialValidation) -> str:
         "camera_degC": validation.camera_degC,
         "frames": validation.frame_count,
         "outside_valid_range": validation.outside,
-        "outside_because": [[reason_names(Outside(int(flag))) for flag in row] for row in validation.flags],
+        "outside_because": [[list_reason_names(Outside(int(flag))) for flag in row] for row in validation.flags],
         "paper_mean_um": {"before": [1e3 * mm for mm in BEFORE_mm], "after": [1e3 * mm for mm in AFTER_mm]},
-        "results": [_result(one) for one in validation.variants],
+        "results": [_serialise_result(one) for one in validation.variants],
     }
-    return json.dumps(plain(document), indent=1, allow_nan=False) + "\n"
+    return json.dumps(make_plain(document), indent=1, allow_nan=False) + "\n"
 
 
-def _result(one: Deviations) -> dict[str, Any]:
+def _serialise_result(one: Deviations) -> dict[str, Any]:
     attribute_of = {written: attribute for attribute, written in _WRITTEN_AS.items()}
     return {name: getattr(one, attribute_of.get(name, name)) for name in _Result.model_fields}
 
@@ -208,14 +208,14 @@ def load_validation(path: Path) -> SpatialValidation:
     """The validation in a file of `compensate validate`; SessionError when it is anything else."""
     file = load_json(path, lambda text: _File.model_validate_json(text, strict=True), "a validation")
     try:
-        return _validation(file)
+        return _build_validation(file)
     except (ValueError, KeyError) as error:
         raise SessionError(f"{path}: not a validation of this program (its arrays do not fit: {error})") from error
 
 
-def _validation(file: _File) -> SpatialValidation:
+def _build_validation(file: _File) -> SpatialValidation:
     shape = (len(file.chamber_degC), len(file.positions))
-    before, after, *others = (_deviations(one, shape) for one in file.results)
+    before, after, *others = (_build_deviations(one, shape) for one in file.results)
     camera_alone, with_stand = (*others, None, None)[:2]
     return SpatialValidation(
         names=tuple(one.name for one in file.positions),
@@ -223,10 +223,12 @@ def _validation(file: _File) -> SpatialValidation:
         rotary_deg=np.array([one.rotary_deg for one in file.positions]),
         distance_mm=np.array([one.distance_mm for one in file.positions]),
         chamber_degC=np.array(file.chamber_degC),
-        camera_degC=_array(file.camera_degC, shape[:1]),
+        camera_degC=_check_array(file.camera_degC, shape[:1]),
         frame_count=np.array(file.frames, np.int64).reshape(shape),
-        outside=_array(file.outside_valid_range, shape),
-        flags=np.array([[_flags(names) for names in row] for row in file.outside_because], np.uint8).reshape(shape),
+        outside=_check_array(file.outside_valid_range, shape),
+        flags=np.array([[_parse_flags(names) for names in row] for row in file.outside_because], np.uint8).reshape(
+            shape
+        ),
         before=before,
         after=after,
         camera_alone=camera_alone,
@@ -238,14 +240,16 @@ def _validation(file: _File) -> SpatialValidation:
     )
 
 
-def _deviations(one: _Result, shape: tuple[int, int]) -> Deviations:
+def _build_deviations(one: _Result, shape: tuple[int, int]) -> Deviations:
     shapes = {"repeat_um": (shape[0], 3), "table_um": (3,), "chi": shape}
     names = [field.name for field in fields(Deviations) if field.name != "name"]
-    arrays = {name: _array(getattr(one, _WRITTEN_AS.get(name, name)), shapes.get(name, (*shape, 3))) for name in names}
+    arrays = {
+        name: _check_array(getattr(one, _WRITTEN_AS.get(name, name)), shapes.get(name, (*shape, 3))) for name in names
+    }
     return Deviations(one.name, **arrays)
 
 
-def _array(values: _Row | _Grid | _Cube, shape: tuple[int, ...]) -> Float:
+def _check_array(values: _Row | _Grid | _Cube, shape: tuple[int, ...]) -> Float:
     """ValueError when the values have another shape."""
     found = np.array(values, np.float64)
     if found.shape != shape:
@@ -253,7 +257,7 @@ def _array(values: _Row | _Grid | _Cube, shape: tuple[int, ...]) -> Float:
     return found
 
 
-def _flags(names: tuple[str, ...]) -> int:
+def _parse_flags(names: tuple[str, ...]) -> int:
     """KeyError for a name that is no reason."""
     found = 0
     for name in names:

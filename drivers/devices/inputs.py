@@ -7,8 +7,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import DeviceLook
-from thermostand.drivers.devices.kinds import Around, DeviceKind
+from thermostand.drivers.devices.device_check import DeviceCheck
+from thermostand.drivers.devices.kinds import DeviceKind, DriverContext
 from thermostand.drivers.settings import DeviceName, Identity, Line, OnBus
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
@@ -88,14 +88,14 @@ class Inputs:
         )
 
 
-def _make(name: str, settings: InputsSettings, around: Around) -> Inputs:
+def _make(name: str, settings: InputsSettings, around: DriverContext) -> Inputs:
     channels = {contact: each.channel for contact, each in settings.contacts.items()}
     return Inputs(name, around.bus, around.map_of("inputs", settings), channels, around.clock)
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Whether each contact is as it is while all is well."""
-    readings = await look.answers()
+    readings = await look.open_and_read()
     for name, contact in look.settings.contacts.items():
         closed = readings.get(name)
         if closed is not None and (closed == 1) == (contact.fault_when == "closed"):

@@ -1,7 +1,7 @@
 """What a kind of device states of itself, once. The stand derives from it how one is made, locked, opened, polled,
 checked, moved by hand, recorded and simulated.
 
-Each driver module has its row, `KIND`, which `built_in` finds. Another package adds one by an entry
+Each driver module has its row, `KIND`, which `load_built_in_kinds` finds. Another package adds one by an entry
 point of the group `thermostand.devices`, named as the kind, which is the row itself; a stand's file has such devices by
 their names below `devices:`, each with its `kind` and what that kind's settings ask for.
 """
@@ -17,7 +17,7 @@ from functools import cache
 from typing import Any, Literal, NamedTuple, Protocol, cast
 
 import thermostand.drivers.devices
-from thermostand.drivers.devices.checking import DeviceLook, check_answers
+from thermostand.drivers.devices.device_check import DeviceCheck, check_answers
 from thermostand.drivers.devices.protocols import Sensor
 from thermostand.drivers.settings import OnBus
 from thermostand.drivers.wires.bus import Bus
@@ -40,7 +40,7 @@ Declared = Callable[[Any, OfSection, MapOf], Iterable[Channel]]  # of its settin
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
+class DriverContext:
     """What a driver may use of the stand that its device is made for. made: the devices before it, by name. known: the
     last reading of a channel. of_section: what another section of the stand's file has. map_of: the register map of a
     unit, named in that section; ConfigError when it is missing or wrong."""
@@ -72,7 +72,7 @@ class VerbNumber(NamedTuple):
     default: float | None = None
 
 
-class Hands(Protocol):
+class ManualActions(Protocol):
     """What the stand does for the verbs of its devices, through gate, interlock and limits, as for a step of a run. All
     raise what those raise."""
 
@@ -119,11 +119,11 @@ class Verb:
 
     name: str
     text: str
-    act: Callable[[Hands, str, Arguments], Work]
+    act: Callable[[ManualActions, str, Arguments], Work]
     arguments: Callable[[Any, OfSection], tuple[VerbNumber, ...]] = lambda settings, of_section: ()
 
 
-def _set_points(settings: object, of_section: OfSection) -> tuple[VerbNumber, ...]:
+def _list_set_points(settings: object, of_section: OfSection) -> tuple[VerbNumber, ...]:
     return (VerbNumber("setpoint_degC", "degC", *of_section("limits").chamber_degC),)
 
 
@@ -135,7 +135,12 @@ CONTROLLED = (
 )
 """What every controller of the chamber's temperature tells."""
 CONTROL = (
-    Verb("set", "heat or cool to a set-point", lambda stand, _, given: stand.heat(given["setpoint_degC"]), _set_points),
+    Verb(
+        "set",
+        "heat or cool to a set-point",
+        lambda stand, _, given: stand.heat(given["setpoint_degC"]),
+        _list_set_points,
+    ),
     Verb("stop", "stop heating and cooling", lambda stand, name, given: stand.stop_heat()),
 )
 """What a person may tell whatever holds the chamber's temperature."""
@@ -151,7 +156,7 @@ class Absence(NamedTuple):
         return f"no {self.what}: {self.means}"
 
 
-def _places(settings: Any) -> Iterable[LockedPlace]:
+def _list_places(settings: Any) -> Iterable[LockedPlace]:
     """Its address, if it has one of its own."""
     address = getattr(settings, "address", None)
     return () if address is None else (LockedPlace("wire", address),)
@@ -180,19 +185,19 @@ class DeviceKind:
 
     name: str
     settings: type[Document]
-    make: Callable[[str, Any, Around], Sensor]
+    make: Callable[[str, Any, DriverContext], Sensor]
     channels: tuple[Channel, ...] | Declared = ()
     section: str = ADDED
     device: str = ""
     rank: int = 85
     is_opened: bool = True
-    places: Callable[[Any], Iterable[LockedPlace]] = _places
+    places: Callable[[Any], Iterable[LockedPlace]] = _list_places
     address_key: str = "address"
     stand_in: Callable[[str, Clock], Sensor] | None = None
     stand_in_s: float | None = None
     missing: Absence | None = None
     advise: Callable[[DeviceError, str, Any], str] = _advise
-    check: Callable[[DeviceLook], Coroutine[None, None, None]] = check_answers
+    check: Callable[[DeviceCheck], Coroutine[None, None, None]] = check_answers
     verbs: tuple[Verb, ...] = ()
     simulated_map: str = ""
     fakes: tuple[str, ...] | None = None
@@ -204,7 +209,7 @@ class DeviceKind:
         return of_protocol if of_protocol in fakes else next(iter(fakes), "")
 
 
-def _channel_fault(name: str, names: Sequence[str]) -> str:
+def _explain_channel_name(name: str, names: Sequence[str]) -> str:
     """Why readings cannot be found by that name among these; "" when they can."""
     if not _CHANNEL_NAME.fullmatch(name):
         return "and a channel's name is of letters, digits and _, a letter first, at most 40; correct the package"
@@ -229,11 +234,11 @@ class Equipment(NamedTuple):
         found = declared if isinstance(declared, tuple) else (*declared(self.settings, of_section, map_of),)
         names = [each.name for each in found]
         for each in found:
-            if fault := _channel_fault(each.name, names):
+            if fault := _explain_channel_name(each.name, names):
                 raise ConfigError(f"{self.name}: its kind {self.kind.name} declares the channel {each.name!r}, {fault}")
         return found
 
-    def made(self, around: Around) -> Sensor:
+    def made(self, around: DriverContext) -> Sensor:
         """The device, or what is in its place; not opened."""
         if self.settings is None and self.kind.stand_in is not None:
             return self.kind.stand_in(self.name, around.clock)
@@ -241,7 +246,7 @@ class Equipment(NamedTuple):
 
 
 @cache
-def built_in() -> tuple[DeviceKind, ...]:
+def load_built_in_kinds() -> tuple[DeviceKind, ...]:
     """The rows of the modules in drivers/devices, in the order of their ranks."""
     found: list[DeviceKind] = []
     root = thermostand.drivers.devices
@@ -251,10 +256,10 @@ def built_in() -> tuple[DeviceKind, ...]:
     return tuple(sorted(found, key=lambda kind: kind.rank))
 
 
-def added_kind(name: str) -> DeviceKind:
+def load_kind(name: str) -> DeviceKind:
     """The kind of that name without a section of its own, ours or another package's; ConfigError when there is none, or
     it cannot be loaded."""
-    if ours := next((kind for kind in built_in() if (kind.name, kind.section) == (name, ADDED)), None):
+    if ours := next((kind for kind in load_built_in_kinds() if (kind.name, kind.section) == (name, ADDED)), None):
         return ours
     kind = load_row(GROUP, name, DeviceKind, "a device of kind")
     if kind.section != ADDED:
@@ -264,23 +269,23 @@ def added_kind(name: str) -> DeviceKind:
     return kind
 
 
-def added_settings(data: object) -> object:
+def load_settings(data: object) -> object:
     """The settings of a device of another package, by its `kind`; ValueError for what they do not take."""
     if not isinstance(data, dict):
         return data
     keys = cast("dict[str, object]", data)
     try:
-        kind = added_kind(str(keys.get("kind", "")))
+        kind = load_kind(str(keys.get("kind", "")))
     except ConfigError as error:
         raise ValueError(str(error)) from error
     return check_settings(kind.settings, keys)
 
 
-def equipment_of(config: object, added: Mapping[str, Any]) -> tuple[Equipment, ...]:
+def list_equipment(config: object, added: Mapping[str, Any]) -> tuple[Equipment, ...]:
     """Every device that a stand's file has, in the order of their ranks, with stand-ins for those that it lacks. added:
     those of other packages, by name."""
-    found = [Equipment(name, added_kind(settings.kind), settings) for name, settings in added.items()]
-    for kind in (each for each in built_in() if each.section != ADDED):
+    found = [Equipment(name, load_kind(settings.kind), settings) for name, settings in added.items()]
+    for kind in (each for each in load_built_in_kinds() if each.section != ADDED):
         section = getattr(config, kind.section)
         named = cast("Mapping[str, Any]", {kind.device: section} if kind.device else section)
         found += [Equipment(name, kind, each) for name, each in named.items() if isinstance(each, kind.settings)]

@@ -17,16 +17,16 @@ from typing import Literal
 
 from pydantic import Field
 
-from thermostand.drivers.devices.kinds import Around, DeviceKind
+from thermostand.drivers.devices.kinds import DeviceKind, DriverContext
 from thermostand.drivers.devices.thermometers import Calibration
-from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, same_device
+from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, check_same_device
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.addresses import ByteAddress
-from thermostand.foundation.calls import Lane
-from thermostand.foundation.clock import Clock, call_pause_s
+from thermostand.foundation.clock import Clock, compute_call_pause_s
 from thermostand.foundation.errors import DeviceError, Refused, Unreachable
 from thermostand.foundation.readings import Channel, Reading, bad_reading
+from thermostand.foundation.workers import WorkerThread
 
 _GAP_S = 0.02  # between a reply and the next request; round number, nothing was measured
 _FAILED = re.compile(r"\*+")  # in the place of a number: not measured
@@ -92,33 +92,35 @@ class Probe:
         self._settings = settings
         self._clock = clock
         self._language = _LANGUAGES[settings.protocol]
-        self._lane: Lane | None = None
+        self._worker: WorkerThread | None = None
         self._lock = asyncio.Lock()
         as_delivered = self._language.line
         line = SerialSettings(
             settings.baud or as_delivered.baud, as_delivered.stopbits, as_delivered.parity, as_delivered.databits
         )
-        self._client = LineClient.at(name, settings.address, line, (settings.timeout_s, call_pause_s(clock, _GAP_S)))
+        self._client = LineClient.at(
+            name, settings.address, line, (settings.timeout_s, compute_call_pause_s(clock, _GAP_S))
+        )
 
     async def open(self) -> None:
         """Which unit answers; Refused when it is another one."""
-        if self._lane is None:
-            self._lane = Lane(self.name, self._clock)
+        if self._worker is None:
+            self._worker = WorkerThread(self.name, self._clock)
         await self.read()
 
     async def close(self) -> None:
         """Let go of the port; may be called twice."""
-        lane, self._lane = self._lane, None
+        lane, self._worker = self._worker, None
         if lane is not None:
             await lane.call(self._client.close)
             lane.close()
 
     async def read(self) -> tuple[Reading, ...]:
         """All it measures; what it cannot measure now is BAD. DeviceError when it does not answer in its language."""
-        if self._lane is None:
+        if self._worker is None:
             raise Unreachable(self.name, "not open")
         async with self._lock:
-            values = await self._lane.call(self._values)
+            values = await self._worker.call(self._read_values)
         now_ns, calibration = self._clock.now_ns(), self._settings.calibration
         readings: list[Reading] = []
         for channel, value in values.items():
@@ -133,24 +135,24 @@ class Probe:
 
     # Below: in the lane's thread.
 
-    def _values(self) -> dict[Channel, float]:
+    def _read_values(self) -> dict[Channel, float]:
         if not self._client.connected:
             self._identify()
-        return self._client.query(self._language.read, self._heard)
+        return self._client.query(self._language.read, self._parse_reply)
 
     def _identify(self) -> None:
         """On each new link."""
         if not self._language.is_named:
             self.identity = Identity(self._language.vendor, self._language.model, "", "", by_map=True)
             return
-        vendor, model, serial_number, version = self._client.query(b"*IDN?\r", _named)
+        vendor, model, serial_number, version = self._client.query(b"*IDN?\r", _parse_identity)
         wanted = self._settings.serial_number
         if wanted is not None and serial_number != wanted:
             self._client.close()
             raise Refused(self.name, f"serial number {serial_number} answers, expected {wanted}")
-        self.identity = same_device(self.name, Identity(vendor, model, serial_number, version), self.identity)
+        self.identity = check_same_device(self.name, Identity(vendor, model, serial_number, version), self.identity)
 
-    def _heard(self, data: bytes) -> dict[Channel, float] | None:
+    def _parse_reply(self, data: bytes) -> dict[Channel, float] | None:
         """The values of the first line that has them all; None until such a line has ended."""
         for line in data.decode("latin-1").split("\n")[:-1]:
             found = {channel: pattern.search(line) for channel, pattern in self._language.values.items()}
@@ -164,13 +166,13 @@ class Probe:
         return math.nan if _FAILED.fullmatch(match[1]) else float(match[1])
 
 
-def _named(data: bytes) -> tuple[str, str, str, str] | None:
+def _parse_identity(data: bytes) -> tuple[str, str, str, str] | None:
     """The four fields of *IDN?."""
     match = _IDENTITY.search(data.decode("latin-1"))
     return None if match is None else (match[1].strip(), match[2].strip(), match[3].strip(), match[4].strip())
 
 
-def _make(name: str, settings: ProbeSettings, around: Around) -> Probe:
+def _make(name: str, settings: ProbeSettings, around: DriverContext) -> Probe:
     return Probe(name, settings, around.clock)
 
 

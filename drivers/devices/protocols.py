@@ -54,11 +54,11 @@ class InForce:
     read back and yet not be what the unit goes to: another set-point bank, a remote set-point, a sensor outside, a
     program, a ramp, an operator at the panel, degrees Fahrenheit.
 
-    known_by: the registers or queries that tell it; "" when none does. not_told: what they leave open; "" for
+    known_by: the registers or queries that tell it; "" when none does. not_reported: what they leave open; "" for
     nothing. objections: a sentence for each thing that acts in its place, with what to do; () while it is in force."""
 
     known_by: str
-    not_told: str = ""
+    not_reported: str = ""
     objections: tuple[str, ...] = ()
 
 
@@ -175,6 +175,6 @@ class Camera(Sensor, Protocol):
         for this frame, that of the settings otherwise. Unreachable when the camera was lost."""
         ...
 
-    async def temperature_place(self) -> str:
+    async def describe_temperature_place(self) -> str:
         """Where its temperature is read, and what else the camera offers, in words; "" when nothing was found."""
         ...

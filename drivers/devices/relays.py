@@ -8,13 +8,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import DeviceLook
-from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, MapOf, OfSection
+from thermostand.drivers.devices.device_check import DeviceCheck
+from thermostand.drivers.devices.kinds import Absence, DeviceKind, DriverContext, MapOf, OfSection
 from thermostand.drivers.settings import Identity, OnBus, PollPeriod_s
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.drivers.wires.registers import Point, RegisterMap
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
 from thermostand.foundation.readings import Channel, Reading
 
@@ -78,7 +78,7 @@ class Relays:
 
     async def open(self) -> None:
         """See that the board answers, and which it is; no relay changes."""
-        await self._known()
+        await self._read_same_board()
 
     async def close(self) -> None:
         """Nothing to let go of; relays stay as they are (a timed one drops by itself)."""
@@ -86,7 +86,7 @@ class Relays:
     async def read(self) -> tuple[Reading, ...]:
         """Every named relay as the board reports it, 1 on, 0 off; raises DeviceError, also when another board than
         before answers."""
-        states = await self._known()
+        states = await self._read_same_board()
         now_ns = self._clock.now_ns()
         return tuple(Reading(f"{self.name}.{channel}", float(on), "1", now_ns) for channel, on in states.items())
 
@@ -128,21 +128,21 @@ class Relays:
             await self._unit.write_coil(address, raw_value)
 
         async def holds() -> bool:
-            return (await self._states())[channel] == on
+            return (await self._read_states())[channel] == on
 
         async with self._lock:
             if on:  # off is never withheld, even from a unit of another identity
-                await self._known()
-            await self._unit.checked(send, holds, f"{channel} {'on' if on else 'off'}")
+                await self._read_same_board()
+            await self._unit.send_and_check(send, holds, f"{channel} {'on' if on else 'off'}")
 
-    async def _known(self) -> dict[str, bool]:
+    async def _read_same_board(self) -> dict[str, bool]:
         """The states of a board that is the one of before."""
         if self._probe_due:
             await self._unit.probe()
             self._probe_due = False
-        return await self._states()
+        return await self._read_states()
 
-    async def _states(self) -> dict[str, bool]:
+    async def _read_states(self) -> dict[str, bool]:
         try:
             snapshot = await self._unit.snapshot(self._points.values())
         except Unreachable:
@@ -194,7 +194,7 @@ class NoRelays:
 
     async def hold_on(self, channel: str, duration_s: float) -> None:
         """Remember it for `duration_s` from now."""
-        self._until_ns[channel] = self._clock.now_ns() + seconds_ns(duration_s)
+        self._until_ns[channel] = self._clock.now_ns() + to_ns(duration_s)
 
     async def make_safe(self) -> None:
         """Nothing is permitted any more."""
@@ -205,20 +205,20 @@ class NoRelays:
         return until_ns is None or self._clock.now_ns() < until_ns
 
 
-def _make(name: str, settings: RelaysSettings, around: Around) -> Relays:
+def _make(name: str, settings: RelaysSettings, around: DriverContext) -> Relays:
     channels = {str(channel): number for channel, number in settings.channels.items()}
     return Relays(name, around.bus, around.map_of("relays", settings), channels)
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Its points, and that nothing is on that should not be."""
     if look.settings is None:
         look.opened.add(look.name)
         text = "no relay board: nothing of this stand's own drops the heat"
         look.found("link", "ok", text, data={"has_timer": False})
         return
-    readings = await look.answers()
-    await look.points()
+    readings = await look.open_and_read()
+    await look.check_points()
     for channel in WATCHED:
         if readings.get(channel) == 1:
             text = f"{channel} is on, though no program has this stand"

@@ -9,14 +9,14 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
-from thermostand.drivers.devices.checking import DeviceLook, Finding
-from thermostand.drivers.devices.kinds import Around, DeviceKind, MapOf, OfSection
+from thermostand.drivers.devices.device_check import DeviceCheck, Finding
+from thermostand.drivers.devices.kinds import DeviceKind, DriverContext, MapOf, OfSection
 from thermostand.drivers.devices.protocols import Sensor
 from thermostand.drivers.settings import Identity, Line, OnBus, Range
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit, Sample
 from thermostand.drivers.wires.registers import RegisterMap
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, Unreachable
 from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
@@ -49,12 +49,12 @@ class Calibration(Document):
             correction_K = correction_K * indicated_degC + coefficient
         return indicated_degC + self.offset_K + correction_K
 
-    def reading(self, channel: str, indicated_degC: float, now_ns: int, doubt: str = "") -> Reading:
+    def reading(self, channel: str, indicated_degC: float, now_ns: int, suspicion: str = "") -> Reading:
         """Of an indication; BAD outside plausible_degC, STALE with a doubt."""
         T_degC, (low_degC, high_degC) = self.calibrated_degC(indicated_degC), self.plausible_degC
         if not low_degC <= T_degC <= high_degC:
             return bad_reading(channel, "degC", now_ns, f"{T_degC:g} degC is outside {low_degC:g}..{high_degC:g} degC")
-        return Reading(channel, T_degC, "degC", now_ns, Quality.STALE if doubt else Quality.GOOD, doubt)
+        return Reading(channel, T_degC, "degC", now_ns, Quality.STALE if suspicion else Quality.GOOD, suspicion)
 
 
 class ThermometerSettings(Calibration):
@@ -74,7 +74,7 @@ class ThermometerSettings(Calibration):
         return self.role == "safety"
 
 
-def by_channel(thermometers: Mapping[str, ThermometerSettings]) -> dict[str, ThermometerSettings]:
+def list_by_channel(thermometers: Mapping[str, ThermometerSettings]) -> dict[str, ThermometerSettings]:
     """The sensors by what they are read as: their place, or their own names."""
     # By role, which models, reports and other programs look for in every session; its own name is in the stand's file.
     return {name if each.role is None or each.is_safety else each.role: each for name, each in thermometers.items()}
@@ -158,22 +158,24 @@ class Thermometers:
         return tuple(
             reading
             for sensor, point in self._points.items()
-            for reading in self._readings(sensor, values.samples[point], self._alarms(point, bits), unconfirmed, now_ns)
+            for reading in self._readings(
+                sensor, values.samples[point], self._describe_alarms(point, bits), unconfirmed, now_ns
+            )
         )
 
     async def _probe(self) -> None:
         await self._unit.probe()
         self._probe_due = False
 
-    def _alarms(self, point: str, bits: Mapping[str, bool]) -> str:
+    def _describe_alarms(self, point: str, bits: Mapping[str, bool]) -> str:
         return ", ".join(bit for bit in self._unit.map.points[point].bad_if if bits.get(bit))
 
     def _readings(self, sensor: str, sample: Sample, alarms: str, unconfirmed: str, now_ns: int) -> Iterator[Reading]:
         channel = f"{self.name}.{sensor}"
-        yield self._calibrated(channel, self._channels[sensor], sample, alarms, unconfirmed, now_ns)
+        yield self._make_calibrated_reading(channel, self._channels[sensor], sample, alarms, unconfirmed, now_ns)
         yield Reading(f"{channel}_raw", float(sample.raw), "1", now_ns)
 
-    def _calibrated(
+    def _make_calibrated_reading(
         self, channel: str, sensor: ThermometerSettings, sample: Sample, alarms: str, unconfirmed: str, now_ns: int
     ) -> Reading:
         if reason := sample.reason or alarms:
@@ -181,7 +183,7 @@ class Thermometers:
         return sensor.reading(channel, sample.value, now_ns, unconfirmed)
 
 
-class SeveralModules:
+class ThermometerModules:
     """Thermometers on several modules under one name, of which each is polled by itself. identity: of the first."""
 
     def __init__(self, modules: Sequence[Thermometers]) -> None:
@@ -206,9 +208,9 @@ class SeveralModules:
         return tuple([reading for module in self.modules for reading in await module.read()])
 
 
-def _make(name: str, settings: ThermometerModuleSettings, around: Around) -> Thermometers | SeveralModules:
+def _make(name: str, settings: ThermometerModuleSettings, around: DriverContext) -> Thermometers | ThermometerModules:
     """Each sensor on the module that has its channel."""
-    sensors = by_channel(around.of_section("thermometers"))
+    sensors = list_by_channel(around.of_section("thermometers"))
     first = around.map_of("thermometer_module", settings)
     count = sum(point.startswith("value_") for point in first.points)
     if not count:
@@ -225,13 +227,13 @@ def _make(name: str, settings: ThermometerModuleSettings, around: Around) -> The
         if not here:
             raise ConfigError(f"thermometer_module: no thermometer has a channel of unit {unit}")
         modules.append(Thermometers(name, around.bus, first.at_unit(unit), here, around.clock))
-    return modules[0] if len(modules) == 1 else SeveralModules(modules)
+    return modules[0] if len(modules) == 1 else ThermometerModules(modules)
 
 
 _LOOKS, _PERIOD_S = 5, 0.3
 
 
-async def _each_other(thermometers: Sensor, regulator: Sensor | None, warn_K: float, clock: Clock) -> Finding:
+async def _compare_thermometers(thermometers: Sensor, regulator: Sensor | None, warn_K: float, clock: Clock) -> Finding:
     """How far each is from the median of all, the regulator's own value among them; a warning beyond `warn_K`. In a
     chamber that has been at rest overnight they all show the same."""
     seen: dict[str, list[float]] = {}
@@ -243,7 +245,7 @@ async def _each_other(thermometers: Sensor, regulator: Sensor | None, warn_K: fl
                 is_pv = device != thermometers.name
                 if reading.unit == "degC" and reading.quality is Quality.GOOD and (not is_pv or name == "pv"):
                     seen.setdefault(f"{device} {name}" if is_pv else name, []).append(reading.value)
-            await clock.sleep_until(clock.now_ns() + seconds_ns(_PERIOD_S))
+            await clock.sleep_until(clock.now_ns() + to_ns(_PERIOD_S))
     except DeviceError as error:
         return Finding(thermometers.name, "each other", "failed", error.text, "check again once it answers")
     if len(seen) < 2:
@@ -265,17 +267,17 @@ async def _each_other(thermometers: Sensor, regulator: Sensor | None, warn_K: fl
     return Finding(thermometers.name, "each other", "ok", text, data=data)
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """The module, each thermometer, and all of them against each other."""
-    if await look.answers():
-        await look.points(f"value_{each.channel}" for each in look.of_section("thermometers").values())
+    if await look.open_and_read():
+        await look.check_points(f"value_{each.channel}" for each in look.of_section("thermometers").values())
         pv = look.made["regulator"] if "regulator" in look.opened else None
-        look.add(await _each_other(look.device, pv, look.of_section("guard").sensors.warn_K, look.clock))
+        look.add(await _compare_thermometers(look.device, pv, look.of_section("guard").sensors.warn_K, look.clock))
 
 
 def _channels(settings: ThermometerModuleSettings, of_section: OfSection, map_of: MapOf) -> Iterator[Channel]:
     """Of each sensor its temperature, and the module's word for it."""
-    for name in by_channel(of_section("thermometers")):
+    for name in list_by_channel(of_section("thermometers")):
         yield Channel(name, "degC", "temperature")
         yield Channel(f"{name}_raw", "1", "count")
 

@@ -141,7 +141,7 @@ A function may return a value and report an error: the error decides.
 """
 
 
-def _declared(library: ctypes.CDLL, signatures: dict[str, str]) -> Iterator[tuple[str, Callable[..., Any]]]:
+def _declare(library: ctypes.CDLL, signatures: dict[str, str]) -> Iterator[tuple[str, Callable[..., Any]]]:
     for name, signature in signatures.items():
         result, _, arguments = signature.partition(" ")
         function = getattr(library, name)
@@ -150,7 +150,7 @@ def _declared(library: ctypes.CDLL, signatures: dict[str, str]) -> Iterator[tupl
         yield name, function
 
 
-def _raising(function: Callable[..., Any], glib: Functions) -> Callable[..., Any]:
+def _wrap_errors(function: Callable[..., Any], glib: Functions) -> Callable[..., Any]:
     """`function` with its GError, which is its last argument, raised and freed."""
 
     def call(*arguments: object) -> Any:
@@ -168,11 +168,11 @@ def _raising(function: Callable[..., Any], glib: Functions) -> Callable[..., Any
 
 
 @functools.cache
-def library() -> Functions:
+def load_library() -> Functions:
     """Aravis, GObject and GLib, loaded once; StandError names the package of a missing one."""
-    glib = dict(_declared(load(("libglib-2.0.so.0",), "libglib2.0-0"), GLIB_FUNCTIONS))
-    gobject = _declared(load(("libgobject-2.0.so.0",), "libglib2.0-0"), GOBJECT_FUNCTIONS)
-    aravis = _declared(load(ARAVIS_SONAMES, "libaravis-0.8-0"), ARAVIS_FUNCTIONS)
+    glib = dict(_declare(load(("libglib-2.0.so.0",), "libglib2.0-0"), GLIB_FUNCTIONS))
+    gobject = _declare(load(("libgobject-2.0.so.0",), "libglib2.0-0"), GOBJECT_FUNCTIONS)
+    aravis = _declare(load(ARAVIS_SONAMES, "libaravis-0.8-0"), ARAVIS_FUNCTIONS)
     reporting = {name for name, signature in ARAVIS_FUNCTIONS.items() if signature.endswith("E")}
-    calls = {name: _raising(function, glib) if name in reporting else function for name, function in aravis}
+    calls = {name: _wrap_errors(function, glib) if name in reporting else function for name, function in aravis}
     return {**calls, **dict(gobject), **glib}

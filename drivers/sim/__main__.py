@@ -17,10 +17,10 @@ import sys
 
 from thermostand.drivers.sim.control import serve_control
 from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
-from thermostand.drivers.sim.laboratory_faults import FaultSchedule, known_to, parse_fault, table
+from thermostand.drivers.sim.laboratory_faults import FaultSchedule, list_known_faults, make_table, parse_fault
 from thermostand.foundation.documents import parse_document
-from thermostand.foundation.ending import Ending
 from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.stop_signal import StopSignal
 
 # Longer than the 15 s after which a dead-man relay drops, so that this can be watched behind a killed daemon.
 _ORPHAN_LIMIT_S = 60.0
@@ -30,9 +30,9 @@ _TICK_S = 0.1
 def main() -> int:
     """Build the laboratory, serve it, take it down."""
     if sys.argv[1:] == ["--faults"]:
-        print(json.dumps(table()))  # noqa: T201 - the answer
+        print(json.dumps(make_table()))  # noqa: T201 - the answer
         return 0
-    ending, parent = Ending((signal.SIGTERM, signal.SIGINT)), os.getppid()
+    ending, parent = StopSignal((signal.SIGTERM, signal.SIGINT)), os.getppid()
     try:
         spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
         laboratory = Laboratory(spec)
@@ -40,7 +40,7 @@ def main() -> int:
         print(f"{error}", file=sys.stderr)  # noqa: T201 - the process' answer to who started it
         return 2
     try:
-        faults = [parse_fault(text, known_to(laboratory)) for text in spec.faults]
+        faults = [parse_fault(text, list_known_faults(laboratory)) for text in spec.faults]
         schedule = FaultSchedule(laboratory, faults)
     except ConfigError as error:
         laboratory.close()

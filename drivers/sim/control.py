@@ -19,9 +19,9 @@ import json
 from collections.abc import Callable
 
 from thermostand.drivers.sim.laboratory import Laboratory
-from thermostand.drivers.sim.laboratory_faults import FaultSchedule, inject, table
+from thermostand.drivers.sim.laboratory_faults import FaultSchedule, inject, make_table
 from thermostand.drivers.sim.wire import LineEngine, LinkFaults, TcpWire
-from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.addresses import parse_tcp_address
 from thermostand.foundation.errors import ConfigError
 
 
@@ -61,9 +61,9 @@ class Control:
                 self._quit()
                 return {}
             case {"do": "optics"}:
-                return {"centres_px": self._laboratory.true_centres_px()}
+                return {"centres_px": self._laboratory.compute_true_centres_px()}
             case {"do": "faults"}:
-                return {"faults": table(self._schedule.known), "standing": self._schedule.standing()}
+                return {"faults": make_table(self._schedule.known), "standing": self._schedule.list_standing()}
             case {"do": "break", "name": str(name), "value": value, "for_s": int() | float() | None as for_s}:
                 self._schedule.break_now(name, value, for_s)
                 return {"name": name}
@@ -82,5 +82,5 @@ class Control:
 def serve_control(laboratory: Laboratory, schedule: FaultSchedule, quit_: Callable[[], None]) -> TcpWire:
     """Listen on the laboratory's control address; `quit_` is called for a `quit` request."""
     control = Control(laboratory, schedule, quit_)
-    place = tcp_place(laboratory.spec.control, may_be_free=True)
+    place = parse_tcp_address(laboratory.spec.control, may_be_free=True)
     return TcpWire(*place, lambda: LineEngine(control.answer), LinkFaults())

@@ -31,10 +31,10 @@ from thermostand.drivers.sim.gige.genicam_file import read_genicam
 from thermostand.drivers.sim.gige.gvsp_sender import Switch
 from thermostand.drivers.sim.motion.flap import FakeFlap
 from thermostand.drivers.sim.motion.ximc import FakeAxis
-from thermostand.drivers.sim.physics.optics import CameraKind, true_centres_px
+from thermostand.drivers.sim.physics.optics import CameraKind, compute_true_centres_px
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec, STEP_s
 from thermostand.drivers.sim.physics.published_camera import PublishedCamera
-from thermostand.drivers.sim.physics.scene import SceneSpec, SimulatedScene, still
+from thermostand.drivers.sim.physics.scene import SceneSpec, SimulatedScene, make_still
 from thermostand.drivers.sim.units.climate_chambers import FakeClimateChamber
 from thermostand.drivers.sim.units.heat_module import FakeHeatModule
 from thermostand.drivers.sim.units.modbus import RtuEngine, TcpEngine, Unit
@@ -43,7 +43,7 @@ from thermostand.drivers.sim.units.relays import FakeRelays
 from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
 from thermostand.drivers.sim.units.thermometers import FakeThermometers, RtdModule
 from thermostand.drivers.sim.wire import Engine, FaultyLink, LinkFaults, PtyWire, TcpWire
-from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.addresses import parse_tcp_address
 from thermostand.foundation.clock import FollowedClock, WallClock
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
@@ -178,12 +178,12 @@ class Laboratory:
     @property
     def regulator(self) -> FakeRegulator:
         """The regulator on the bus; ValueError when there is none."""
-        return self._there(FakeRegulator, "regulator on its bus")
+        return self._find_first(FakeRegulator, "regulator on its bus")
 
     @property
     def relays(self) -> FakeRelays:
         """The relay board; ValueError when there is none."""
-        return self._there(FakeRelays, "relay board")
+        return self._find_first(FakeRelays, "relay board")
 
     @property
     def inputs(self) -> FakeRelays | None:
@@ -194,22 +194,22 @@ class Laboratory:
     @property
     def heat_module(self) -> FakeHeatModule:
         """The analog output that heats; ValueError when there is none."""
-        return self._there(FakeHeatModule, "analog output")
+        return self._find_first(FakeHeatModule, "analog output")
 
     @property
     def chamber(self) -> FakeClimateChamber:
         """The climate chamber with a controller of its own; ValueError when there is none."""
-        return self._there(FakeClimateChamber, "climate chamber of its own")
+        return self._find_first(FakeClimateChamber, "climate chamber of its own")
 
     @property
     def imager(self) -> FakeThermalImager:
         """The thermal imager; ValueError when there is none."""
-        return self._there(FakeThermalImager, "thermal imager")
+        return self._find_first(FakeThermalImager, "thermal imager")
 
     @property
     def flap(self) -> FakeFlap:
         """The flap; ValueError when there is none."""
-        return self._there(FakeFlap, "flap")
+        return self._find_first(FakeFlap, "flap")
 
     @property
     def thermometer_modules(self) -> tuple[RtdModule, ...]:
@@ -224,7 +224,7 @@ class Laboratory:
             raise ValueError("this laboratory has an ADAM-4015")
         return first
 
-    def _there(self, kind: type[Found], what: str) -> Found:
+    def _find_first(self, kind: type[Found], what: str) -> Found:
         """The first of its kind."""
         found = next((each for each in self.fakes.values() if isinstance(each, kind)), None)
         if found is None:
@@ -274,11 +274,11 @@ class Laboratory:
         with self.plant.at(self.clock) as now_ns:
             return {"now_ns": now_ns, **self.plant.state(), "flap_open": self.plant.flap_open_at(now_ns)}
 
-    def true_centres_px(self) -> list[list[float]]:
+    def compute_true_centres_px(self) -> list[list[float]]:
         """Noise-free marker centres (x, y) as the camera named so, or the first, sees them; marker 1 first."""
         with self.plant.at(self.clock) as now_ns:
             leading = "camera" if "camera" in self._cameras else next(iter(self._cameras), "")
-            return true_centres_px(self.plant.optics(now_ns, self._optics_of(leading))).tolist()
+            return compute_true_centres_px(self.plant.optics(now_ns, self._optics_of(leading))).tolist()
 
     def close(self) -> None:
         """Take everything down, last built first."""
@@ -296,11 +296,11 @@ class Laboratory:
             path = address.removeprefix("serial:")
             wire: PtyWire | TcpWire = PtyWire(Path(path) if path else None, make_engine(), faults)
         else:
-            wire = TcpWire(*tcp_place(address, may_be_free=True), make_engine, faults)
+            wire = TcpWire(*parse_tcp_address(address, may_be_free=True), make_engine, faults)
         self._links[name] = FaultyLink(wire, faults)
-        self.found_at(name, wire.address, wire.close)
+        self.register_address(name, wire.address, wire.close)
 
-    def found_at(self, name: str, address: str, close: Callable[[], None]) -> None:
+    def register_address(self, name: str, address: str, close: Callable[[], None]) -> None:
         """It answers there, by means of its own."""
         self._closers.append(close)
         self.addresses[name] = address
@@ -350,7 +350,7 @@ class Laboratory:
         scene = SimulatedScene(SceneSpec(), seed)
         genicam = read_genicam(settings.genicam) if settings.genicam is not None else None
         kind, has_flap = self._optics_of(name), "flap" in self.fakes
-        picture = still(scene.render) if settings.still else scene.render
+        picture = make_still(scene.render) if settings.still else scene.render
 
         def render(time_ns: int, exposure_s: float, gain_dB: float, rows: int) -> NDArray[np.uint8]:
             with self.plant.lock:
@@ -374,7 +374,7 @@ class Laboratory:
                 thermometers=self.published.get(name),
             )
 
-        return at(settings.address) if settings.address else _at_a_free_address(at)
+        return at(settings.address) if settings.address else _bind_free_address(at)
 
     def _share_a_switch(self) -> None:
         """Between several cameras and the computer; in virtual time they take turns, and need none."""
@@ -392,7 +392,7 @@ class Laboratory:
             camera.held_chip_degC = self.camera_sensor_degC
 
 
-def _at_a_free_address(at: Callable[[str], FakeCamera]) -> FakeCamera:
+def _bind_free_address(at: Callable[[str], FakeCamera]) -> FakeCamera:
     number, tries_left = secrets.SystemRandom(), _FREE_ADDRESS_TRIES
     while True:
         address = f"127.{number.randrange(64, 255)}.{number.randrange(256)}.{number.randrange(1, 255)}"
@@ -407,6 +407,6 @@ def _at_a_free_address(at: Callable[[str], FakeCamera]) -> FakeCamera:
 @fake("cameras", rank=CAMERAS)
 def _build_camera(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeCamera:
     camera = bench.camera_at(name)
-    bench.found_at(name, camera.address, camera.close)
+    bench.register_address(name, camera.address, camera.close)
     camera.start()
     return camera

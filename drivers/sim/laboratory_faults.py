@@ -25,7 +25,7 @@ from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import FLAG_DRIVER_OVERHEAT, FLAG_WINDING_MISMATCH
 from thermostand.drivers.sim.units.thermal_imager import SERIAL_NUMBER
 from thermostand.drivers.sim.wire import LINK_FAULTS, set_link_fault
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import ConfigError
 
 Setter = Callable[[Laboratory, object], None]
@@ -53,7 +53,7 @@ def number_or_none(value: object) -> float | None:
     return None if value is None else float(str(value))
 
 
-def to(path: str, kind: Callable[[object], object] = bool) -> Setter:
+def make_setter(path: str, kind: Callable[[object], object] = bool) -> Setter:
     """Sets one attribute of one fake, by its path from the laboratory."""
     owner, _, attribute = path.rpartition(".")
 
@@ -63,7 +63,7 @@ def to(path: str, kind: Callable[[object], object] = bool) -> Setter:
     return apply
 
 
-def given(path: str, worst: float, text: str) -> Breakage:
+def make_number_call(path: str, worst: float, text: str) -> Breakage:
     """A number is given to a method of one fake, unless the value is none."""
 
     def apply(laboratory: Laboratory, value: object) -> None:
@@ -73,29 +73,29 @@ def given(path: str, worst: float, text: str) -> Breakage:
     return Breakage(apply, worst, None, text)
 
 
-def amount(path: str, worst: float, text: str) -> Breakage:
+def make_amount(path: str, worst: float, text: str) -> Breakage:
     """One attribute of one fake is this number, 0 once it is mended."""
-    return Breakage(to(path, number), worst, 0.0, text)
+    return Breakage(make_setter(path, number), worst, 0.0, text)
 
 
-def held(path: str, worst: float, text: str) -> Breakage:
+def make_held_number(path: str, worst: float, text: str) -> Breakage:
     """One attribute of one fake is this number, None once it is mended."""
-    return Breakage(to(path, number_or_none), worst, None, text)
+    return Breakage(make_setter(path, number_or_none), worst, None, text)
 
 
-def whole(path: str, worst: int, mended: int, text: str) -> Breakage:
+def make_whole_number(path: str, worst: int, mended: int, text: str) -> Breakage:
     """One attribute of one fake is this whole number."""
-    return Breakage(to(path, lambda value: int(number(value))), worst, mended, text)
+    return Breakage(make_setter(path, lambda value: int(number(value))), worst, mended, text)
 
 
-def flag(path: str, text: str) -> Breakage:
+def make_flag(path: str, text: str) -> Breakage:
     """One attribute of one fake is true."""
-    return Breakage(to(path), True, False, text)
+    return Breakage(make_setter(path), True, False, text)
 
 
-def shown(path: str, word: str, text: str) -> Breakage:
+def make_shown_word(path: str, word: str, text: str) -> Breakage:
     """One attribute of one fake is this word, None once it is mended."""
-    return Breakage(to(path, lambda value: word if value else None), True, False, text)
+    return Breakage(make_setter(path, lambda value: word if value else None), True, False, text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class Once:
             self.act(laboratory)
 
 
-def once(path: str, text: str) -> Breakage:
+def make_once(path: str, text: str) -> Breakage:
     """A method of one fake is called."""
     return Breakage(Once(lambda laboratory: attrgetter(path)(laboratory)()), True, False, text)
 
@@ -120,14 +120,14 @@ _AIR = "air"
 _ERRORS = {"feedback": ERROR_FEEDBACK_DISCONNECT, "power": ERROR_NO_POWER, "current": ERROR_HARD_OVER_CURRENT}
 
 
-def known_to(laboratory: Laboratory) -> dict[str, Breakage]:
+def list_known_faults(laboratory: Laboratory) -> dict[str, Breakage]:
     """FAULTS, and those of the lines and axes that this laboratory has."""
-    return FAULTS | faults_of(laboratory.links, laboratory.axes)
+    return FAULTS | make_link_and_axis_faults(laboratory.links, laboratory.axes)
 
 
 def inject(laboratory: Laboratory, name: str, value: object) -> None:
     """Set one of those known to it to `value`; KeyError, TypeError or ValueError when name or value is none."""
-    fault = known_to(laboratory)[name]
+    fault = list_known_faults(laboratory)[name]
     with laboratory.plant.lock if fault.locks else nullcontext():
         fault.apply(laboratory, value)
 
@@ -147,7 +147,9 @@ def _sensors(laboratory: Laboratory) -> dict[str, int]:
     return laboratory.spec.devices["thermometers"].settings["channels"]
 
 
-def sensors(attribute: str, kind: Callable[[Laboratory, object], object], worst: object, text: str) -> Breakage:
+def make_sensor_fault(
+    attribute: str, kind: Callable[[Laboratory, object], object], worst: object, text: str
+) -> Breakage:
     """One attribute of each module of thermometers."""
 
     def apply(laboratory: Laboratory, value: object) -> None:
@@ -177,7 +179,7 @@ def _clamp_set_point(laboratory: Laboratory, value: object) -> None:
 def _silent_relays(laboratory: Laboratory, value: object) -> None:
     """The board does not answer for so many s of simulated time."""
     relays, plant = laboratory.relays, laboratory.plant
-    until_ns = plant.now_ns + seconds_ns(number(value))
+    until_ns = plant.now_ns + to_ns(number(value))
     relays.silent = plant.now_ns < until_ns
 
     def wait(time_ns: int, dt_s: float) -> None:
@@ -214,25 +216,40 @@ def _camera_without_stream(laboratory: Laboratory, value: object) -> None:
         laboratory.camera.restart()
 
 
-def _its(attribute: str, kind: Callable[[object], object] = bool) -> Callable[[FakeAxis, object], None]:
+def _make_axis_setter(attribute: str, kind: Callable[[object], object] = bool) -> Callable[[FakeAxis, object], None]:
     return lambda axis, value: setattr(axis, attribute, kind(value))
 
 
-def _danger(bits: int) -> Callable[[FakeAxis, object], None]:
+def _make_danger_setter(bits: int) -> Callable[[FakeAxis, object], None]:
     return lambda axis, value: setattr(axis, "danger", axis.danger & ~bits | (bits if value else 0))
 
 
 # Kind -> what is done to the axis, worst value, the one that mends it, meaning.
 AXIS_FAULTS: dict[str, tuple[Callable[[FakeAxis, object], None], object, object, str]] = {
-    "limit_hit": (_its("limit", lambda side: str(side or "")), "right", "", "left or right: this switch reads closed"),
-    "wrong_limit": (_its("wrong_limit"), True, False, "a stop at a switch is taken for the other one's"),
-    "lost_steps": (_its("lost_steps", number), 200, 0, "steps by which the mechanics fall back, the count does not"),
-    "jam_steps": (_its("stall_steps", number_or_none), 0, None, "steps beyond which the mechanics do not go"),
-    "ctp_error": (_its("ctp_error"), True, False, "encoder and count differ"),
-    "overheated": (_danger(FLAG_DRIVER_OVERHEAT), True, False, "the motor's driver is too warm"),
-    "winding": (_danger(FLAG_WINDING_MISMATCH), True, False, "the windings differ"),
-    "endless": (_its("endless"), True, False, "a move does not end"),
-    "motor_off": (_its("motor_off"), True, False, "no current; the next move brings it back"),
+    "limit_hit": (
+        _make_axis_setter("limit", lambda side: str(side or "")),
+        "right",
+        "",
+        "left or right: this switch reads closed",
+    ),
+    "wrong_limit": (_make_axis_setter("wrong_limit"), True, False, "a stop at a switch is taken for the other one's"),
+    "lost_steps": (
+        _make_axis_setter("lost_steps", number),
+        200,
+        0,
+        "steps by which the mechanics fall back, the count does not",
+    ),
+    "jam_steps": (
+        _make_axis_setter("stall_steps", number_or_none),
+        0,
+        None,
+        "steps beyond which the mechanics do not go",
+    ),
+    "ctp_error": (_make_axis_setter("ctp_error"), True, False, "encoder and count differ"),
+    "overheated": (_make_danger_setter(FLAG_DRIVER_OVERHEAT), True, False, "the motor's driver is too warm"),
+    "winding": (_make_danger_setter(FLAG_WINDING_MISMATCH), True, False, "the windings differ"),
+    "endless": (_make_axis_setter("endless"), True, False, "a move does not end"),
+    "motor_off": (_make_axis_setter("motor_off"), True, False, "no current; the next move brings it back"),
     "restart": (
         lambda axis, value: axis.power_cycle() if value else None,
         True,
@@ -242,176 +259,184 @@ AXIS_FAULTS: dict[str, tuple[Callable[[FakeAxis, object], None], object, object,
 }
 
 
-def _on_axis(name: str, act: Callable[[FakeAxis, object], None]) -> Setter:
+def _make_axis_fault(name: str, act: Callable[[FakeAxis, object], None]) -> Setter:
     return lambda laboratory, value: act(laboratory.axis(name), value)
 
 
-def _on_link(name: str, kind: str) -> Setter:
+def _make_link_fault(name: str, kind: str) -> Setter:
     return lambda laboratory, value: set_link_fault(laboratory.link(name), kind, value)
 
 
-def faults_of(links: Iterable[str], axes: Iterable[str]) -> dict[str, Breakage]:
+def make_link_and_axis_faults(links: Iterable[str], axes: Iterable[str]) -> dict[str, Breakage]:
     """Every link has the same, `bus.drop`, `linear.drop`, ..., and every axis, `linear.limit_hit`, ..."""
     of_links = {
-        f"{name}.{kind}": Breakage(_on_link(name, kind), worst, mended, text, locks=False)
+        f"{name}.{kind}": Breakage(_make_link_fault(name, kind), worst, mended, text, locks=False)
         for name in links
         for kind, (worst, mended, text) in LINK_FAULTS.items()
     }
     return of_links | {
-        f"{name}.{kind}": Breakage(_on_axis(name, act), worst, mended, text)
+        f"{name}.{kind}": Breakage(_make_axis_fault(name, act), worst, mended, text)
         for name in axes
         for kind, (act, worst, mended, text) in AXIS_FAULTS.items()
     }
 
 
 FAULTS: dict[str, Breakage] = {
-    **faults_of(("bus", "chamber", *AXES), AXES),
+    **make_link_and_axis_faults(("bus", "chamber", *AXES), AXES),
     # The regulator and its probe.
-    "regulator.silent": flag("regulator.silent", "it does not answer"),
-    "regulator.compoway": flag("regulator.compoway", "back to its own protocol"),
-    "regulator.restart": once("regulator.power_cycle", "off and on again"),
-    "regulator.sensor_break": flag("regulator.sensor_break", "open sensor"),
-    "regulator.ad_error": flag("regulator.ad_error", "its converter has failed"),
-    "regulator.pv_offset_K": amount("regulator.pv_offset_K", 5.0, "it reads wrong"),
-    "regulator.stuck_pv_degC": held("regulator.stuck_pv_degC", 24.0, "its PV stays there"),
-    "regulator.pv_drift_K_per_h": amount("regulator.pv_drift_K_per_h", 5.0, "its PV drifts"),
-    "regulator.probe_out": flag("regulator.probe_out", "its probe hangs in the laboratory"),
+    "regulator.silent": make_flag("regulator.silent", "it does not answer"),
+    "regulator.compoway": make_flag("regulator.compoway", "back to its own protocol"),
+    "regulator.restart": make_once("regulator.power_cycle", "off and on again"),
+    "regulator.sensor_break": make_flag("regulator.sensor_break", "open sensor"),
+    "regulator.ad_error": make_flag("regulator.ad_error", "its converter has failed"),
+    "regulator.pv_offset_K": make_amount("regulator.pv_offset_K", 5.0, "it reads wrong"),
+    "regulator.stuck_pv_degC": make_held_number("regulator.stuck_pv_degC", 24.0, "its PV stays there"),
+    "regulator.pv_drift_K_per_h": make_amount("regulator.pv_drift_K_per_h", 5.0, "its PV drifts"),
+    "regulator.probe_out": make_flag("regulator.probe_out", "its probe hangs in the laboratory"),
     "regulator.probe_exchanged": Breakage(_exchange_probes, True, False, "its probe with the air's thermometer"),
-    "regulator.set_point_degC": given("regulator.press_setpoint", 45.0, "somebody changes it with the keys"),
+    "regulator.set_point_degC": make_number_call("regulator.press_setpoint", 45.0, "somebody changes it with the keys"),
     "regulator.set_point_clamp_degC": Breakage(
         _clamp_set_point, (15.0, 30.0), None, "[low, high]: it takes no set-point outside, and acknowledges it"
     ),
-    "regulator.acting_degC": held("regulator.acting_degC", 45.0, "another set-point acts: multi-SP, or the remote one"),
-    "regulator.ramp_K_per_min": held("regulator.ramp_K_per_min", 0.5, "a ramp of its own"),
-    "regulator.stop_key": once("regulator.press_stop", "somebody stops control"),
+    "regulator.acting_degC": make_held_number(
+        "regulator.acting_degC", 45.0, "another set-point acts: multi-SP, or the remote one"
+    ),
+    "regulator.ramp_K_per_min": make_held_number("regulator.ramp_K_per_min", 0.5, "a ramp of its own"),
+    "regulator.stop_key": make_once("regulator.press_stop", "somebody stops control"),
     "regulator.manual_percent": Breakage(_press_manual, 50.0, None, "somebody dials in a heating output"),
     "regulator.autotune": Breakage(
         lambda lab, value: lab.regulator.press_autotune(bool(value)), True, False, "somebody starts it with the keys"
     ),
-    "regulator.decimals": whole("regulator.display_decimals", 0, 1, "its decimal point"),
+    "regulator.decimals": make_whole_number("regulator.display_decimals", 0, 1, "its decimal point"),
     # Contact thermometers; values by the channel's name.
-    "thermometer.open": sensors("open_channels", _channel, _AIR, "this one's wire is broken"),
-    "thermometer.shorted": sensors("shorted_channels", _channel, _AIR, "this one is shorted"),
-    "thermometer.pulled_out": sensors("pulled_out", _channel, _AIR, "this one hangs in the laboratory"),
-    "thermometer.noisy": sensors(
+    "thermometer.open": make_sensor_fault("open_channels", _channel, _AIR, "this one's wire is broken"),
+    "thermometer.shorted": make_sensor_fault("shorted_channels", _channel, _AIR, "this one is shorted"),
+    "thermometer.pulled_out": make_sensor_fault("pulled_out", _channel, _AIR, "this one hangs in the laboratory"),
+    "thermometer.noisy": make_sensor_fault(
         "noisy_channel",
         lambda lab, value: next(iter(_channel(lab, value)), None),
         _AIR,
         "this one has 1 K of noise",
     ),
-    "thermometer.offset_K": sensors("offset_K", _numbers, {_AIR: 5.0}, "{name: K}"),
-    "thermometer.drift_K_per_h": sensors("drift_K_per_h", _numbers, {_AIR: 2.0}, "{name: K/h}"),
-    "thermometer.stuck_degC": sensors("stuck_degC", _numbers, {_AIR: 24.0}, "{name: degC}"),
-    "thermometer.held_degC": sensors("held_degC", _numbers, {_AIR: 24.0}, "{name: degC}, with the converter's noise"),
-    "thermometers.silent": flag("thermometers.silent", "they do not answer"),
-    "thermometers.no_fault_bits": flag("thermometers.no_fault_bits", "unreadable: their values are STALE"),
+    "thermometer.offset_K": make_sensor_fault("offset_K", _numbers, {_AIR: 5.0}, "{name: K}"),
+    "thermometer.drift_K_per_h": make_sensor_fault("drift_K_per_h", _numbers, {_AIR: 2.0}, "{name: K/h}"),
+    "thermometer.stuck_degC": make_sensor_fault("stuck_degC", _numbers, {_AIR: 24.0}, "{name: degC}"),
+    "thermometer.held_degC": make_sensor_fault(
+        "held_degC", _numbers, {_AIR: 24.0}, "{name: degC}, with the converter's noise"
+    ),
+    "thermometers.silent": make_flag("thermometers.silent", "they do not answer"),
+    "thermometers.no_fault_bits": make_flag("thermometers.no_fault_bits", "unreadable: their values are STALE"),
     "thermometers.wrong_type": Breakage(_wrong_module, True, False, "a module with another range"),
     # A climate chamber with a controller of its own.
-    "chamber.mute": flag("chamber.silent", "it does not answer"),
-    "chamber.ignores_writes": flag("chamber.ignores_writes", "not in remote"),
-    "chamber.protected": flag("chamber.protected", "the panel refuses (ESPEC)"),
-    "chamber.clamps": flag("chamber.clamps", "it cuts set-points silently"),
-    "chamber.alarm": Breakage(to("chamber.alarm", lambda value: str(value or "")), "31", "", "its code"),
-    "chamber.humidity": flag("chamber.humidity_on", "it is on"),
-    "chamber.stuck_degC": held("chamber.stuck_degC", 24.0, "its own sensor stays there"),
-    "chamber.set_point_degC": given("chamber.press_setpoint", 45.0, "somebody changes it at the panel"),
-    "chamber.program_degC": held("chamber.program_degC", 45.0, "a program of its own runs, and goes there"),
-    "chamber.bank": whole("chamber.bank", 1, 0, "working temperature that acts: 0 is T1 (Julabo)"),
-    "chamber.stop_key": once("chamber.press_stop", "somebody stops it"),
-    "chamber.restart": once("chamber.restart", "a power failure: it is stopped"),
+    "chamber.mute": make_flag("chamber.silent", "it does not answer"),
+    "chamber.ignores_writes": make_flag("chamber.ignores_writes", "not in remote"),
+    "chamber.protected": make_flag("chamber.protected", "the panel refuses (ESPEC)"),
+    "chamber.clamps": make_flag("chamber.clamps", "it cuts set-points silently"),
+    "chamber.alarm": Breakage(make_setter("chamber.alarm", lambda value: str(value or "")), "31", "", "its code"),
+    "chamber.humidity": make_flag("chamber.humidity_on", "it is on"),
+    "chamber.stuck_degC": make_held_number("chamber.stuck_degC", 24.0, "its own sensor stays there"),
+    "chamber.set_point_degC": make_number_call("chamber.press_setpoint", 45.0, "somebody changes it at the panel"),
+    "chamber.program_degC": make_held_number("chamber.program_degC", 45.0, "a program of its own runs, and goes there"),
+    "chamber.bank": make_whole_number("chamber.bank", 1, 0, "working temperature that acts: 0 is T1 (Julabo)"),
+    "chamber.stop_key": make_once("chamber.press_stop", "somebody stops it"),
+    "chamber.restart": make_once("chamber.restart", "a power failure: it is stopped"),
     # The plant, and the relays.
-    "heater.cut_out": flag("plant.cut_out_open", "the thermal cut-out is open"),
+    "heater.cut_out": make_flag("plant.cut_out_open", "the thermal cut-out is open"),
     "heater.welded_share": Breakage(
-        to("ssr_welded_share", number), 1.0, None, "its solid-state relay conducts this share"
+        make_setter("ssr_welded_share", number), 1.0, None, "its solid-state relay conducts this share"
     ),
     "inputs.changed": Breakage(_change_contact, None, None, "name of a contact that is not as it is while all is well"),
-    "relays.silent": flag("relays.silent", "the board does not answer"),
+    "relays.silent": make_flag("relays.silent", "the board does not answer"),
     "relays.silent_s": Breakage(_silent_relays, 60.0, 0, "for so long; its timed-on relays time out and drop"),
-    "relays.lost_writes": flag("relays.lost_writes", "acknowledged, not done"),
-    "relays.brown_out": once("relays.power_cycle", "every relay opens"),
+    "relays.lost_writes": make_flag("relays.lost_writes", "acknowledged, not done"),
+    "relays.brown_out": make_once("relays.power_cycle", "every relay opens"),
     "relays.welded": Breakage(
-        to("relays.welded", lambda value: {str(value)} if value else set[str]()),
+        make_setter("relays.welded", lambda value: {str(value)} if value else set[str]()),
         "heater_enable",
         None,
         "this contact conducts regardless of the coil",
     ),
     "relays.no_rearm": Breakage(
-        to("relays.rearms", lambda value: not value),
+        make_setter("relays.rearms", lambda value: not value),
         True,
         False,
         "a timed-on that runs does not start its time again",
     ),
-    "relays.no_timer": Breakage(to("relays.times", lambda value: not value), True, False, "a timed-on stays on"),
-    # The analog output of a regulator of our own.
-    "heat_module.silent": flag("heat_module.silent", "it does not answer"),
-    "heat_module.stuck_mA": held("heat_module.stuck_mA", 12.0, "it gives this, whatever is written"),
-    "heat_module.lost_writes": flag("heat_module.lost_writes", "writes to its outputs are acknowledged, not done"),
-    "heat_module.restart": once("heat_module.power_cycle", "off and on again"),
-    "heat_module.refreshed_by": Breakage(
-        to("heat_module.refreshed_by", str), "nothing", "requests", "what its watchdog is kept by"
+    "relays.no_timer": Breakage(
+        make_setter("relays.times", lambda value: not value), True, False, "a timed-on stays on"
     ),
-    "heat_module.written_mA": given("heat_module.write_mA", 12.0, "another master writes this to it"),
+    # The analog output of a regulator of our own.
+    "heat_module.silent": make_flag("heat_module.silent", "it does not answer"),
+    "heat_module.stuck_mA": make_held_number("heat_module.stuck_mA", 12.0, "it gives this, whatever is written"),
+    "heat_module.lost_writes": make_flag("heat_module.lost_writes", "writes to its outputs are acknowledged, not done"),
+    "heat_module.restart": make_once("heat_module.power_cycle", "off and on again"),
+    "heat_module.refreshed_by": Breakage(
+        make_setter("heat_module.refreshed_by", str), "nothing", "requests", "what its watchdog is kept by"
+    ),
+    "heat_module.written_mA": make_number_call("heat_module.write_mA", 12.0, "another master writes this to it"),
     # Axes by the name of the axis, as value.
     "axis.alarm": Breakage(_alarm_axis, "linear", None, "the alarm of this axis stands"),
     # The flap.
-    "flap.jam": held("flap.jam_position", 2000, "feedback counts at which it stops"),
+    "flap.jam": make_held_number("flap.jam_position", 2000, "feedback counts at which it stops"),
     "flap.error": Breakage(
-        to("flap.active_errors", lambda value: _ERRORS[str(value)] if value else 0),
+        make_setter("flap.active_errors", lambda value: _ERRORS[str(value)] if value else 0),
         "feedback",
         None,
         "feedback, power or current: this error bit stands",
     ),
-    "flap.unplugged": flag("flap.unplugged", "off the USB"),
-    "flap.stall": flag("flap.stall", "its transfers stall (EPIPE)"),
-    "flap.timeout": flag("flap.timeout", "its transfers time out"),
-    "flap.short_read": flag("flap.short_read", "half of each reply"),
-    "flap.restart": once("flap.restart", "its controller restarts"),
+    "flap.unplugged": make_flag("flap.unplugged", "off the USB"),
+    "flap.stall": make_flag("flap.stall", "its transfers stall (EPIPE)"),
+    "flap.timeout": make_flag("flap.timeout", "its transfers time out"),
+    "flap.short_read": make_flag("flap.short_read", "half of each reply"),
+    "flap.restart": make_once("flap.restart", "its controller restarts"),
     # The thermal imager.
-    "imager.stopped": flag("imager.stopped", "stores no more pictures"),
-    "imager.cut": flag("imager.cut", "its files end too early; mended, they go on"),
-    "imager.plain": flag("imager.plain", "pictures without temperatures"),
-    "imager.damaged": flag("imager.damaged", "the counts lack their end"),
-    "imager.clock_s": amount("imager.clock_s", 3600.0, "its clock is ahead by this"),
+    "imager.stopped": make_flag("imager.stopped", "stores no more pictures"),
+    "imager.cut": make_flag("imager.cut", "its files end too early; mended, they go on"),
+    "imager.plain": make_flag("imager.plain", "pictures without temperatures"),
+    "imager.damaged": make_flag("imager.damaged", "the counts lack their end"),
+    "imager.clock_s": make_amount("imager.clock_s", 3600.0, "its clock is ahead by this"),
     "imager.serial_number": Breakage(
-        to("imager.serial_number", str), "49009999", SERIAL_NUMBER, "pictures of another imager"
+        make_setter("imager.serial_number", str), "49009999", SERIAL_NUMBER, "pictures of another imager"
     ),
-    "imager.again": flag("imager.again", "the last picture under new names"),
-    "imager.unplugged": flag("imager.unplugged", "its folder is gone"),
+    "imager.again": make_flag("imager.again", "the last picture under new names"),
+    "imager.unplugged": make_flag("imager.unplugged", "its folder is gone"),
     # The camera that is named so, or the first.
-    "camera.loss": amount("camera.faults.loss", 0.05, "share of stream packets lost"),
-    "camera.burst": whole("camera.faults.burst", 20, 1, "packets lost in a row"),
-    "camera.no_resend": flag("camera.faults.no_resend", "nothing is sent again"),
-    "camera.no_leader": flag("camera.faults.drop_leader", "frames lack it"),
-    "camera.no_trailer": flag("camera.faults.drop_trailer", "frames lack it"),
-    "camera.trigger_twice": flag("camera.faults.trigger_twice", "a trigger gives two frames"),
-    "camera.truncated": amount("camera.faults.truncated", 0.05, "share of packets cut in half"),
-    "camera.doubled": amount("camera.faults.doubled", 0.05, "share of packets sent twice"),
-    "camera.reordered": amount("camera.faults.reordered", 0.05, "share of packets sent late"),
-    "camera.leader_early_s": amount("camera.faults.leader_early_s", 0.4, "leaders are so far ahead of the payload"),
-    "camera.stretch_s": amount("camera.faults.stretch_s", 0.4, "the payload takes so long"),
-    "camera.unpaced": flag("camera.faults.unpaced", "packets leave in one burst"),
-    "camera.acks_twice": flag("camera.faults.acks_twice", "each answer twice"),
-    "camera.pending": whole("camera.faults.pending", 3, 0, "answers are late"),
-    "camera.stamp_zero": shown("camera.faults.stamp", "zero", "its time stamps are 0"),
-    "camera.stamp_backwards": shown("camera.faults.stamp", "backwards", "its time stamps run backwards"),
-    "camera.no_ticks": flag("camera.faults.no_ticks", "its clock does not tick"),
+    "camera.loss": make_amount("camera.faults.loss", 0.05, "share of stream packets lost"),
+    "camera.burst": make_whole_number("camera.faults.burst", 20, 1, "packets lost in a row"),
+    "camera.no_resend": make_flag("camera.faults.no_resend", "nothing is sent again"),
+    "camera.no_leader": make_flag("camera.faults.drop_leader", "frames lack it"),
+    "camera.no_trailer": make_flag("camera.faults.drop_trailer", "frames lack it"),
+    "camera.trigger_twice": make_flag("camera.faults.trigger_twice", "a trigger gives two frames"),
+    "camera.truncated": make_amount("camera.faults.truncated", 0.05, "share of packets cut in half"),
+    "camera.doubled": make_amount("camera.faults.doubled", 0.05, "share of packets sent twice"),
+    "camera.reordered": make_amount("camera.faults.reordered", 0.05, "share of packets sent late"),
+    "camera.leader_early_s": make_amount(
+        "camera.faults.leader_early_s", 0.4, "leaders are so far ahead of the payload"
+    ),
+    "camera.stretch_s": make_amount("camera.faults.stretch_s", 0.4, "the payload takes so long"),
+    "camera.unpaced": make_flag("camera.faults.unpaced", "packets leave in one burst"),
+    "camera.acks_twice": make_flag("camera.faults.acks_twice", "each answer twice"),
+    "camera.pending": make_whole_number("camera.faults.pending", 3, 0, "answers are late"),
+    "camera.stamp_zero": make_shown_word("camera.faults.stamp", "zero", "its time stamps are 0"),
+    "camera.stamp_backwards": make_shown_word("camera.faults.stamp", "backwards", "its time stamps run backwards"),
+    "camera.no_ticks": make_flag("camera.faults.no_ticks", "its clock does not tick"),
     "camera.silent": Breakage(_silent_camera, True, False, "neither answers nor sends"),
-    "camera.stalled": flag("camera.faults.silent_gvsp", "answers, but sends no frame"),
-    "camera.deaf": flag("camera.faults.silent_gvcp", "sends, but does not answer"),
+    "camera.stalled": make_flag("camera.faults.silent_gvsp", "answers, but sends no frame"),
+    "camera.deaf": make_flag("camera.faults.silent_gvcp", "sends, but does not answer"),
     "camera.control_lost": Breakage(
         lambda lab, value: lab.camera.seize(bool(value)), True, False, "another client has taken control of it"
     ),
-    "camera.restart": once("camera.restart", "by itself, its supply on"),
+    "camera.restart": make_once("camera.restart", "by itself, its supply on"),
     "camera.no_stream_channel": Breakage(_camera_without_stream, True, False, "it restarts, and does not offer one"),
-    "camera.sensor_degC": held("camera_sensor_degC", 75.0, "its sensor chip stays at this"),
-    "camera.frozen_temperature": shown("camera.faults.temperature", "stuck", "it keeps showing the last one"),
-    "camera.no_temperature": shown("camera.faults.temperature", "zero", "it shows 0 degC"),
-    "camera.refused_temperature": shown("camera.faults.temperature", "access", "its register cannot be read"),
-    "camera.temperature_offset_K": amount("camera.faults.temperature_offset_K", 10.0, "it shows a wrong one"),
+    "camera.sensor_degC": make_held_number("camera_sensor_degC", 75.0, "its sensor chip stays at this"),
+    "camera.frozen_temperature": make_shown_word("camera.faults.temperature", "stuck", "it keeps showing the last one"),
+    "camera.no_temperature": make_shown_word("camera.faults.temperature", "zero", "it shows 0 degC"),
+    "camera.refused_temperature": make_shown_word("camera.faults.temperature", "access", "its register cannot be read"),
+    "camera.temperature_offset_K": make_amount("camera.faults.temperature_offset_K", 10.0, "it shows a wrong one"),
 }
 
 
-def table(known: Mapping[str, Breakage] = FAULTS) -> list[dict[str, object]]:
+def make_table(known: Mapping[str, Breakage] = FAULTS) -> list[dict[str, object]]:
     """Faults for people and programs: name, worst, mended, text."""
     return [
         {"name": name, "worst": fault.worst, "mended": fault.mended, "text": fault.text}
@@ -473,7 +498,7 @@ class FaultSchedule:
         """Breaks what is due at the start; ConfigError when this laboratory cannot have what is planned, then or later:
         each is tried and mended again, but for what happens in an instant and leaves its traces."""
         self._laboratory = laboratory
-        self.known = known_to(laboratory)
+        self.known = list_known_faults(laboratory)
         self._lock = threading.Lock()
         self._due: list[tuple[int, int, str, object]] = []
         self._number = itertools.count()
@@ -484,13 +509,13 @@ class FaultSchedule:
             if planned.at_s > 0 and not isinstance(self.known[planned.name].apply, Once):
                 self._set(planned.name, planned.value)
                 self._set(planned.name, self.known[planned.name].mended)
-            at_ns = start_ns + seconds_ns(planned.at_s)
+            at_ns = start_ns + to_ns(planned.at_s)
             self._push(at_ns, planned.name, planned.value)
             if planned.for_s is not None:
-                self._push(at_ns + seconds_ns(planned.for_s), planned.name, self.known[planned.name].mended)
+                self._push(at_ns + to_ns(planned.for_s), planned.name, self.known[planned.name].mended)
         self._break_until(start_ns)
 
-    def standing(self) -> dict[str, object]:
+    def list_standing(self) -> dict[str, object]:
         """What is broken now, with its value; what just happens (a restart) is not."""
         with self._lock:
             return dict(self._standing)
@@ -504,9 +529,7 @@ class FaultSchedule:
             self._set(name, value)
             self._forget_end(name)
             if for_s is not None:
-                self._ends[name] = self._push(
-                    self._laboratory.now_ns + seconds_ns(for_s), name, self.known[name].mended
-                )
+                self._ends[name] = self._push(self._laboratory.now_ns + to_ns(for_s), name, self.known[name].mended)
 
     def mend(self, name: str) -> None:
         """By hand; ConfigError as in `break_now`."""

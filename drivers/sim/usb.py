@@ -27,7 +27,7 @@ from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
 from thermostand.drivers.sim.wire import LineEngine, LinkFaults, TcpWire
-from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.addresses import parse_tcp_address
 
 GET_DESCRIPTOR_IN, GET_DESCRIPTOR, STRING_DESCRIPTOR = 0x80, 6, 3
 LANGUAGES = b"\x04\x03\x09\x04"  # one language: English (United States)
@@ -154,7 +154,7 @@ def _string(device: FakeUsbDevice, index: int) -> bytes:
 
 def get_backend(address: str) -> ForwardingBackend:
     """A pyusb backend that finds the devices of the simulator at `address`, "tcp:HOST:PORT"; ValueError else."""
-    return ForwardingBackend(*tcp_place(address))
+    return ForwardingBackend(*parse_tcp_address(address))
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,7 +150,7 @@ class PtyWire:
         self._is_plugged = False
         self.address = f"serial:{self._path}"
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = _held(self._path)
+        self._lock = _lock_path(self._path)
         self.plug()
 
     def plug(self) -> None:
@@ -200,7 +200,7 @@ class PtyWire:
                 os.close(descriptor)
 
 
-def _held(path: Path) -> BinaryIO:
+def _lock_path(path: Path) -> BinaryIO:
     """The lock of a path, which ends with the process: a link that a killed simulator has left is taken over, that of a
     living one is not."""
     if path.exists() and not path.is_symlink():

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.drivers.framing.aravis_library import Functions, library
+from thermostand.drivers.framing.aravis_library import Functions, load_library
 from thermostand.drivers.wires.camera_settings import BITS_PER_PIXEL, PixelFormat, frame_bytes
 
 PACKET_SOCKET_DISABLED = 1  # ArvGvStreamOption: else root would get AF_PACKET and everyone else a UDP socket
@@ -69,7 +69,7 @@ class GigeDevice:
     """
 
     def __init__(self, address: str) -> None:
-        self._library = library()
+        self._library = load_library()
         self._camera = self._library["arv_camera_new"](address.encode())
         self._device = self._library["arv_camera_get_device"](self._camera)  # borrowed: never unref
         self.is_gige = bool(self._library["arv_camera_is_gv_device"](self._camera))
@@ -278,14 +278,14 @@ class GigeStream:
         )
 
     def pixels(self, buffer: int, pixel_format: PixelFormat, shape: tuple[int, int]) -> Pixels | None:
-        """The image of `shape` (height, width) in an array of its own, as of `unpacked`; None when the buffer has too
-        few bytes (chunk data may follow the pixels)."""
+        """The image of `shape` (height, width) in an array of its own, as of `unpack_pixels`; None when the buffer
+        has too few bytes (chunk data may follow the pixels)."""
         size, length = frame_bytes(pixel_format, shape[0] * shape[1]), ctypes.c_size_t()
         address = self._library["arv_buffer_get_data"](buffer, ctypes.byref(length))
         if not address or length.value < size:
             return None
         pointer = ctypes.cast(address, ctypes.POINTER(ctypes.c_uint8))
-        return unpacked(pixel_format, np.ctypeslib.as_array(pointer, shape=(size,)).copy(), shape)
+        return unpack_pixels(pixel_format, np.ctypeslib.as_array(pointer, shape=(size,)).copy(), shape)
 
     def counters(self) -> dict[str, int]:
         """Aravis' own counters of this stream (n_completed_buffers, n_resend_requests, ...)."""
@@ -295,7 +295,7 @@ class GigeStream:
         return {name.decode(): int(self._call("arv_stream_get_info_uint64_by_name", name)) for name in names}
 
 
-def unpacked(pixel_format: PixelFormat, data: NDArray[np.uint8], shape: tuple[int, int]) -> Pixels:
+def unpack_pixels(pixel_format: PixelFormat, data: NDArray[np.uint8], shape: tuple[int, int]) -> Pixels:
     """The image of `shape` (height, width) in `data` (frame_bytes of them): uint8, or uint16 with the camera's own
     values (0..1023 of 10 bits, 0..4095 of 12)."""
     count = shape[0] * shape[1]
@@ -304,13 +304,13 @@ def unpacked(pixel_format: PixelFormat, data: NDArray[np.uint8], shape: tuple[in
     if BITS_PER_PIXEL[pixel_format] == 16:
         return data.view("<u2").reshape(shape)
     if pixel_format == "Mono10p":
-        return _of_10_bits(data, count).reshape(shape)
-    return _of_three_bytes(pixel_format, data, count).reshape(shape)
+        return _unpack_10_bits(data, count).reshape(shape)
+    return _unpack_three_bytes(pixel_format, data, count).reshape(shape)
 
 
-def _of_three_bytes(pixel_format: PixelFormat, data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
+def _unpack_three_bytes(pixel_format: PixelFormat, data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
     """Two pixels in three bytes, the middle one shared."""
-    first, middle, last = _groups(data, 3)
+    first, middle, last = _group_bytes(data, 3)
     pairs = np.empty((len(first), 2), np.uint16)
     if pixel_format == "Mono12p":  # the first pixel's low bits come first
         pairs[:, 0] = first | (middle & 0xF) << 8
@@ -324,16 +324,16 @@ def _of_three_bytes(pixel_format: PixelFormat, data: NDArray[np.uint8], count: i
     return pairs.reshape(-1)[:count]
 
 
-def _of_10_bits(data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
+def _unpack_10_bits(data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
     """Four pixels in five bytes, low bits first."""
-    groups = _groups(data, 5)
+    groups = _group_bytes(data, 5)
     pixels = np.empty((len(groups[0]), 4), np.uint16)
     for i in range(4):
         pixels[:, i] = (groups[i] >> 2 * i | groups[i + 1] << 8 - 2 * i) & 0x3FF
     return pixels.reshape(-1)[:count]
 
 
-def _groups(data: NDArray[np.uint8], size: int) -> NDArray[np.uint16]:
+def _group_bytes(data: NDArray[np.uint8], size: int) -> NDArray[np.uint16]:
     """Shape (size, groups): the bytes of each group of `size`, the last one filled up with zeros."""
     whole = np.zeros(-(-len(data) // size) * size, np.uint16)
     whole[: len(data)] = data

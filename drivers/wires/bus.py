@@ -15,9 +15,9 @@ from typing import TypeVar
 
 from thermostand.drivers.wires.modbus_client import BusSettings, FaultKind, ModbusClient, WireFault
 from thermostand.drivers.wires.registers import Space
-from thermostand.foundation.calls import Lane
-from thermostand.foundation.clock import Clock, call_pause_s, seconds_ns
+from thermostand.foundation.clock import Clock, compute_call_pause_s, to_ns
 from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
+from thermostand.foundation.workers import WorkerThread
 
 __all__ = ["Bus", "BusCounters", "BusSettings"]
 
@@ -79,7 +79,7 @@ class _Health:
         """After one more."""
         failures = self.failures + 1
         period_s = PROBE_PERIODS_S[min(max(0, failures - DEAD_AFTER_FAILURES), len(PROBE_PERIODS_S) - 1)]
-        return _Health(failures, silent, now_ns + seconds_ns(period_s))
+        return _Health(failures, silent, now_ns + to_ns(period_s))
 
 
 class Bus:
@@ -96,9 +96,9 @@ class Bus:
         self.counters = BusCounters()
         self.clock = clock
         self._client = ModbusClient(settings)
-        self._gap_s = call_pause_s(clock, settings.gap_s) if self._client.serial else 0.0
+        self._gap_s = compute_call_pause_s(clock, settings.gap_s) if self._client.serial else 0.0
         self._quarantine_s = settings.timeout_s + QUARANTINE_MARGIN_S
-        self._lane: Lane | None = None
+        self._worker: WorkerThread | None = None
         self._health: dict[int, _Health] = {}
         self._line_fault = ""  # why the line is down, "" while it is up
         self._reopen_ns = 0
@@ -112,16 +112,16 @@ class Bus:
 
     async def open(self) -> None:
         """Open the port or connection; raises Unreachable with the reason. Later losses are reopened by themselves."""
-        if self._lane is None:
-            self._lane = Lane(self.name, self.clock)
+        if self._worker is None:
+            self._worker = WorkerThread(self.name, self.clock)
         try:
-            await self._lane.call(self._client.connect)
+            await self._worker.call(self._client.connect)
         except WireFault as fault:
-            raise self._failure(self.name, 0, fault) from fault
+            raise self._make_failure(self.name, 0, fault) from fault
 
     async def close(self) -> None:
         """Let go of the line; may be called twice."""
-        lane, self._lane = self._lane, None
+        lane, self._worker = self._worker, None
         if lane is not None:
             await lane.call(self._client.close)
             lane.close()
@@ -160,25 +160,25 @@ class Bus:
 
     async def _call(self, device: str, unit: int, function: Callable[..., Result], *args: object) -> Result:
         """One transaction in the lane, its outcome entered in the unit's health and the counters."""
-        if self._lane is None:
+        if self._worker is None:
             raise Unreachable(device, f"{self.name} is not open")
         self.counters.transactions += 1
         try:
-            result = await self._lane.call(self._transact, function, unit, *args)
+            result = await self._worker.call(self._transact, function, unit, *args)
         except WireFault as fault:
-            raise self._failure(device, unit, fault) from fault
+            raise self._make_failure(device, unit, fault) from fault
         self._health[unit] = _Health()
         self._line_fault = ""
         return result
 
-    def _failure(self, device: str, unit: int, fault: WireFault) -> DeviceError:
+    def _make_failure(self, device: str, unit: int, fault: WireFault) -> DeviceError:
         """Count `fault` against the unit, 0 for none, or the line; the error to raise."""
         self.counters.count(fault.fault)
         now_ns = self.clock.now_ns()
         match fault.fault:
             case FaultKind.LINE_DOWN:
                 # The first loss is retried at once (a gateway hangs up when idle), a lasting one once a second.
-                self._reopen_ns = now_ns + seconds_ns(REOPEN_PERIOD_S) if self._line_fault else now_ns
+                self._reopen_ns = now_ns + to_ns(REOPEN_PERIOD_S) if self._line_fault else now_ns
                 self._line_fault = str(fault)
             case FaultKind.SILENCE | FaultKind.GARBLED:
                 silent = fault.fault is FaultKind.SILENCE

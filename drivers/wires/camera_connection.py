@@ -12,7 +12,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from thermostand.drivers.framing.aravis_library import AravisError
-from thermostand.drivers.settings import Identity, same_device
+from thermostand.drivers.settings import Identity, check_same_device
 from thermostand.drivers.wires.aravis import (
     BUFFER_STATUS,
     BUFFER_SUCCESS,
@@ -24,25 +24,25 @@ from thermostand.drivers.wires.aravis import (
     GigeStream,
     Pixels,
 )
-from thermostand.drivers.wires.camera_apply import (
+from thermostand.drivers.wires.camera_configuration import (
     TICK_FREQUENCY_HIGH,
     TICK_FREQUENCY_LOW,
     apply_settings,
+    fire_software_trigger,
     read_identity,
     set_exposure,
-    software_trigger,
 )
 from thermostand.drivers.wires.camera_errors import NO_CONTROL_HINT
 from thermostand.drivers.wires.camera_settings import AravisCameraSettings, GigeCameraSettings, TemperatureFeature
 from thermostand.drivers.wires.camera_temperature import (
     NoTemperature,
+    describe_place,
     find_temperature,
     read_temperature,
-    temperature_place,
 )
 from thermostand.drivers.wires.frame_count import FrameCount
-from thermostand.foundation.addresses import stated
-from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, seconds_ns
+from thermostand.foundation.addresses import get_display_address
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, block_until, to_ns
 from thermostand.foundation.errors import Refused
 from thermostand.foundation.readings import Cause
 
@@ -119,17 +119,17 @@ class Connection:
         self._latched_at_ns = 0
         self._stamped_ns = 0  # the last time stamp, on the camera's clock
         self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
-        self._device = _open_controlled(name, settings)
+        self._device = _open_with_control(name, settings)
         try:
             self._device.on_control_lost(self.control_lost.set)
             self.identity = read_identity(self._device)
             serial_number = self.identity.serial_number
             if settings.serial_number not in (None, serial_number):
                 raise Refused(name, f"serial number {settings.serial_number} is expected, {serial_number} answers")
-            same_device(name, self.identity, answered)
+            check_same_device(name, self.identity, answered)
             self._stop_quietly()  # a client that died may have left it running, with its settings locked
             self.effective = apply_settings(name, self._device, settings)
-            self._period_ns = seconds_ns(1 / self.effective.frame_rate_hz)
+            self._period_ns = to_ns(1 / self.effective.frame_rate_hz)
             self._exposure_asked_s = settings.exposure_s
             self._exposure_s = self.effective.exposure_s
             self._temperature = self._find_temperature()
@@ -205,7 +205,7 @@ class Connection:
         """Set the exposure, throw away what came before, keep the camera's clock tied to ours."""
         self._set_exposure(exposure_s)
         self._discard()
-        if self._offset_ns is None or self._clock.now_ns() - self._latched_at_ns > seconds_ns(LATCH_AGAIN_S):
+        if self._offset_ns is None or self._clock.now_ns() - self._latched_at_ns > to_ns(LATCH_AGAIN_S):
             self._latch()
         self._give_one_away = self._free_run and self._offset_ns is None  # its exposure may have begun before the call
 
@@ -214,11 +214,11 @@ class Connection:
         self.prepare(exposure_s)
         block_until(self._clock, due_ns)
         trigger_ns = self._clock.now_ns()
-        software_trigger(self._device)
+        fire_software_trigger(self._device)
         self._counts["triggers"] += 1
         return self._take(trigger_ns, self._exposure_s + self._timeout_s)
 
-    def next_free(self, newer_than_ns: int) -> Shot | None:
+    def take_next_free(self, newer_than_ns: int) -> Shot | None:
         """The next complete frame whose exposure began at or after an instant, or None when none came in time."""
         shot = self._take(newer_than_ns, self._timeout_s)
         if shot is not None and self._offset_ns is not None:
@@ -229,7 +229,7 @@ class Connection:
         """When the first free-run frame that begins at or after `time_ns` has been exposed."""
         periods = -((self._phase_ns - time_ns) // self._period_ns)  # rounded up
         begin_ns = self._phase_ns + periods * self._period_ns
-        return begin_ns + seconds_ns(self._exposure_s)
+        return begin_ns + to_ns(self._exposure_s)
 
     def temperature(self) -> tuple[float, str, Cause]:
         """The camera's temperature in degC and "", or NaN, the reason and who says so. A place that was not found is
@@ -237,7 +237,7 @@ class Connection:
         before a minute has passed."""
         place = self._temperature
         is_slow = isinstance(place, NoTemperature) and place.cause == "wire"
-        if not is_slow or self._clock.now_ns() - self._looked_ns >= seconds_ns(TEMPERATURE_AGAIN_S):
+        if not is_slow or self._clock.now_ns() - self._looked_ns >= to_ns(TEMPERATURE_AGAIN_S):
             try:
                 place = self._temperature = self._find_temperature() if isinstance(place, NoTemperature) else place
             except AravisError as error:
@@ -249,7 +249,7 @@ class Connection:
     def temperature_place(self) -> str:
         """Where the temperature is read, and what else the camera offers, in words; "" when it was not found."""
         place = self._temperature
-        return "" if isinstance(place, NoTemperature) else temperature_place(self._device, place)
+        return "" if isinstance(place, NoTemperature) else describe_place(self._device, place)
 
     def _find_temperature(self) -> TemperatureFeature | NoTemperature:
         if not self._settings.has_temperature:
@@ -261,13 +261,13 @@ class Connection:
 
     def _discard(self) -> None:
         """Give back every finished frame unused."""
-        stream = self._streaming()
+        stream = self._require_stream()
         while (buffer := stream.pop(0)) is not None:
             self._counts["stale"] += 1
             self._frames.advance(stream.info(buffer).frame_id)
             stream.push(buffer)
 
-    def _streaming(self) -> GigeStream:
+    def _require_stream(self) -> GigeStream:
         if self._stream is None:
             raise ValueError("acquisition is not running")
         return self._stream
@@ -280,7 +280,7 @@ class Connection:
 
     def _take(self, newer_than_ns: int, timeout_s: float) -> Shot | None:
         """The next frame that is not stale, or None when it is late or not whole."""
-        stream = self._streaming()
+        stream = self._require_stream()
         for _ in range(self._settings.buffers + 1):
             buffer = stream.pop(timeout_s)
             if buffer is None:
@@ -288,13 +288,13 @@ class Connection:
                 break
             try:
                 info = stream.info(buffer)
-                image = self._image(stream, buffer, info)
+                image = self._copy_image(stream, buffer, info)
             finally:
                 stream.push(buffer)
             self._frames.advance(info.frame_id)
             if image is None:
                 break
-            stamped_ns = self._stand_ns(info.timestamp_ns)
+            stamped_ns = self._to_stand_ns(info.timestamp_ns)
             if stamped_ns is not None and stamped_ns < newer_than_ns - STAMP_SLACK_NS:
                 self._counts["stale"] += 1
                 continue
@@ -302,11 +302,11 @@ class Connection:
                 self._give_one_away = False
                 self._counts["stale"] += 1
                 return None
-            return self._shot(stream, image, info.timestamp_ns, newer_than_ns, stamped_ns)
+            return self._make_shot(stream, image, info.timestamp_ns, newer_than_ns, stamped_ns)
         self._failed += 1
         return None
 
-    def _image(self, stream: GigeStream, buffer: int, info: BufferInfo) -> Pixels | None:
+    def _copy_image(self, stream: GigeStream, buffer: int, info: BufferInfo) -> Pixels | None:
         """The pixels in an array of their own, or None when the frame is not whole."""
         shape = self.effective.height_px, self.effective.width_px
         if info.status != BUFFER_SUCCESS:
@@ -321,13 +321,13 @@ class Connection:
         image.setflags(write=False)
         return image
 
-    def _shot(
+    def _make_shot(
         self, stream: GigeStream, image: Pixels, camera_ticks: int, newer_than_ns: int, stamped_ns: int | None
     ) -> Shot:
         """The frame with its time, the losses before it, and the temperature right after it."""
         start_ns, dropped = newer_than_ns, self._failed
         if self._free_run:
-            start_ns = self._clock.now_ns() - seconds_ns(self._exposure_s) if stamped_ns is None else stamped_ns
+            start_ns = self._clock.now_ns() - to_ns(self._exposure_s) if stamped_ns is None else stamped_ns
             if stamped_ns is not None:  # whole periods between the call and the frame were lost
                 dropped = max(0, (stamped_ns - newer_than_ns) // self._period_ns)
         self._failed = 0
@@ -343,14 +343,14 @@ class Connection:
             self._counts[counter] += value - self._stream_counts.get(counter, 0)
         self._stream_counts = now
 
-    def _stand_ns(self, timestamp_ns: int) -> int | None:
+    def _to_stand_ns(self, timestamp_ns: int) -> int | None:
         """The camera's time stamp on the stand's clock, None when it is not to be believed: 0, before the last
         one, or in the future. The clocks are compared again before the next frame then."""
         if self._offset_ns is None:
             return None
         earlier_ns, self._stamped_ns = self._stamped_ns, timestamp_ns
         time_ns = timestamp_ns + self._offset_ns
-        is_ahead = time_ns > self._clock.now_ns() + seconds_ns(self._exposure_s) + FUTURE_NS
+        is_ahead = time_ns > self._clock.now_ns() + to_ns(self._exposure_s) + FUTURE_NS
         if timestamp_ns == 0 or timestamp_ns < earlier_ns or is_ahead:
             self._counts["bad_time_stamps"] += 1
             self._latched_at_ns = 0
@@ -388,7 +388,7 @@ class Connection:
         return self._device.read_register(high) << 32 | self._device.read_register(low)
 
 
-def _open_controlled(name: str, settings: AravisCameraSettings) -> GigeDevice:
+def _open_with_control(name: str, settings: AravisCameraSettings) -> GigeDevice:
     """The camera with us in control.
 
     A client that died keeps the camera until its heartbeat runs out: try for that long and a little more.
@@ -399,7 +399,9 @@ def _open_controlled(name: str, settings: AravisCameraSettings) -> GigeDevice:
         device = GigeDevice(settings.address)
         if device.is_gige != wants_gige:
             device.close()
-            raise Refused(name, f"{stated(settings.address)} is {'no' if wants_gige else 'a'} GigE Vision camera")
+            raise Refused(
+                name, f"{get_display_address(settings.address)} is {'no' if wants_gige else 'a'} GigE Vision camera"
+            )
         if device.is_controller():
             return device
         device.close()

@@ -11,17 +11,17 @@ GVSP_BYTES = 28 + 8  # IP, UDP and GVSP header within a packet (GigE Vision 1.2,
 _MARGIN = 1.1  # packets of the control channel, and senders that are not quite even
 
 
-def packet_wire_ns(packet_size: int, line_Mbps: float) -> float:
+def compute_packet_wire_ns(packet_size: int, line_Mbps: float) -> float:
     """How long an IP packet of so many bytes takes on the line."""
     return (packet_size + ETHERNET_BYTES) * 8 / line_Mbps * 1e3
 
 
-def packet_delay_ns(packet_size: int, line_Mbps: float, shared_by: int) -> int:
+def compute_packet_delay_ns(packet_size: int, line_Mbps: float, shared_by: int) -> int:
     """The pause between two packets in which one packet of each other camera fits; 0 for a camera alone."""
-    return round((shared_by - 1) * packet_wire_ns(packet_size, line_Mbps) * _MARGIN)
+    return round((shared_by - 1) * compute_packet_wire_ns(packet_size, line_Mbps) * _MARGIN)
 
 
-def frame_wire_s(frame_bytes: int, packet_size: int, line_Mbps: float, delay_ns: int = 0) -> float:
+def compute_frame_wire_s(frame_bytes: int, packet_size: int, line_Mbps: float, delay_ns: int = 0) -> float:
     """How long a frame takes to arrive: its packets, leader and trailer, with the pauses."""
     packets = -(-frame_bytes // (packet_size - GVSP_BYTES)) + 2
-    return packets * (packet_wire_ns(packet_size, line_Mbps) + delay_ns) / NS_PER_S
+    return packets * (compute_packet_wire_ns(packet_size, line_Mbps) + delay_ns) / NS_PER_S

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from thermostand.drivers.framing.aravis_library import AravisError
 from thermostand.drivers.wires.aravis import GigeDevice
-from thermostand.drivers.wires.camera_dialects import TEMPERATURE_ENTRIES, TEMPERATURES
 from thermostand.drivers.wires.camera_errors import is_silence
 from thermostand.drivers.wires.camera_settings import TemperatureFeature
+from thermostand.drivers.wires.genicam_feature_names import TEMPERATURE_ENTRIES, TEMPERATURES
 from thermostand.foundation.readings import Cause
 
 VERSION = 0x0000  # the bootstrap register that each camera has (GigE Vision 1.2, section 28)
@@ -29,9 +29,9 @@ def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> T
     AravisError when the camera does not answer for anything: then nothing is known about it.
     """
     try:
-        places = [wanted] if wanted else _usual(device)
+        places = [wanted] if wanted else _list_usual_features(device)
     except AravisError as error:
-        return _unread(device, "where its temperature is", error)
+        return _make_no_temperature(device, "where its temperature is", error)
     for place in places:
         try:
             if place.feature is not None and not device.available(place.feature):
@@ -39,13 +39,13 @@ def find_temperature(device: GigeDevice, wanted: TemperatureFeature | None) -> T
             if place.selector is not None and place.entry is not None:
                 device.set_string(place.selector, place.entry)  # once: selector and value are two transactions
         except AravisError as error:
-            return _unread(device, _named(place), error, _offered(device, place))
+            return _make_no_temperature(device, _describe_place(place), error, _describe_offered(device, place))
         return place
     names = [wanted.feature or ""] if wanted else [feature for feature, _ in TEMPERATURES]
     return NoTemperature(f"the camera has no {' and no '.join(names)}")
 
 
-def _unread(device: GigeDevice, what: str, error: AravisError, offered: str = "") -> NoTemperature:
+def _make_no_temperature(device: GigeDevice, what: str, error: AravisError, offered: str = "") -> NoTemperature:
     """The error again when it is not for these features alone that the camera does not answer."""
     text = f"{what} cannot be read ({error}){offered}"
     if not is_silence(error):
@@ -57,7 +57,7 @@ def _unread(device: GigeDevice, what: str, error: AravisError, offered: str = ""
     return NoTemperature(text, "wire")
 
 
-def _usual(device: GigeDevice) -> list[TemperatureFeature]:
+def _list_usual_features(device: GigeDevice) -> list[TemperatureFeature]:
     """The makes' features, each with the entry nearest to the sensor that this camera's selector offers."""
     places: list[TemperatureFeature] = []
     for feature, selector in TEMPERATURES:
@@ -67,18 +67,18 @@ def _usual(device: GigeDevice) -> list[TemperatureFeature]:
     return places
 
 
-def temperature_place(device: GigeDevice, place: TemperatureFeature) -> str:
+def describe_place(device: GigeDevice, place: TemperatureFeature) -> str:
     """Where that is, and what the camera offers for its selector, in words."""
-    return f"{_named(place)}{_offered(device, place)}"
+    return f"{_describe_place(place)}{_describe_offered(device, place)}"
 
 
-def _named(place: TemperatureFeature) -> str:
+def _describe_place(place: TemperatureFeature) -> str:
     if place.feature is None:
         return f"register {place.register_address or 0:#x}"
     return place.feature if place.selector is None else f"{place.feature} of {place.selector} {place.entry!r}"
 
 
-def _offered(device: GigeDevice, place: TemperatureFeature) -> str:
+def _describe_offered(device: GigeDevice, place: TemperatureFeature) -> str:
     """What the camera offers for the selector, as the end of a sentence; "" when there is none, or it does not say."""
     try:
         entries = device.entries(place.selector) if place.selector is not None else ()

@@ -61,7 +61,7 @@ class FoundCamera:
     serial: str
 
 
-def serial_ports() -> tuple[SerialPort, ...]:
+def list_serial_ports() -> tuple[SerialPort, ...]:
     """Those with hardware behind them, by address."""
     lasting = {path.resolve(): str(path) for path in _links("/dev/serial/by-id", "/dev/ximc")}
     found: list[SerialPort] = []
@@ -75,7 +75,7 @@ def serial_ports() -> tuple[SerialPort, ...]:
     return tuple(sorted(found, key=lambda port: port.address))
 
 
-def usb_devices(root: Path = Path("/sys/bus/usb/devices")) -> tuple[UsbDevice, ...]:
+def list_usb_devices(root: Path = Path("/sys/bus/usb/devices")) -> tuple[UsbDevice, ...]:
     """All but hubs, as the kernel lists them: nothing is opened, and no right to do so is needed."""
     found: list[UsbDevice] = []
     for device in sorted(root.glob("*")):
@@ -100,7 +100,7 @@ def _text(path: Path) -> str:
     return ""
 
 
-async def cameras_at(addresses: Sequence[str], limit_s: float) -> tuple[FoundCamera, ...]:
+async def find_cameras(addresses: Sequence[str], limit_s: float) -> tuple[FoundCamera, ...]:
     """The GigE Vision cameras that answer within `limit_s` (real seconds), by address; each address is asked twice, for
     a datagram may be lost. ValueError for one that is no IPv4 address, OSError for one that cannot be reached."""
     for address in addresses:

@@ -70,7 +70,7 @@ class LineClient:
             try:
                 _discard(self._link)
             except Unreachable:
-                self._closed_by_peer()
+                self._close_after_peer()
         return self._link is not None or self._hang_ups.is_known
 
     def close(self) -> None:
@@ -108,7 +108,7 @@ class LineClient:
         says as much."""
         count, count_before = self._flow_count(heard), self._flow_count(before)
         is_as_before = count == count_before or min(count, count_before) > 0
-        if count != self._flow_bytes and not (is_as_before and _size(heard) == _size(before)):
+        if count != self._flow_bytes and not (is_as_before and _count_characters(heard) == _count_characters(before)):
             return False
         self._flow_bytes = count
         return True
@@ -133,7 +133,7 @@ class LineClient:
                 heard += data
                 text = heard.translate(None, _FLOW_CONTROL) if self._is_text else heard
                 if (found := answer(text)) is not None:
-                    self._answered()
+                    self._note_answer()
                     return found, heard
                 if len(heard) > _LONGEST_REPLY:
                     raise ValueError("it does not end")
@@ -141,7 +141,7 @@ class LineClient:
             self._quarantine()
             raise GarbledReply(self._device, f"no valid reply in {heard[:80]!r}: {error}") from error
         except Unreachable:
-            self._is_asked_again = not heard and self._closed_by_peer()
+            self._is_asked_again = not heard and self._close_after_peer()
             self.close()
             raise
         self._is_swallowed = is_first and not heard
@@ -172,23 +172,23 @@ class LineClient:
                 _discard(link)
                 return link
             except Unreachable:
-                if not (self._closed_by_peer() and (is_read or self._hang_ups.is_known)):
+                if not (self._close_after_peer() and (is_read or self._hang_ups.is_known)):
                     raise
         link = self._link = self._connect()
         self._hang_ups.opened()
         self._is_first = True
         return link
 
-    def _answered(self) -> None:
+    def _note_answer(self) -> None:
         self._hang_ups.answered()
         self._free_s = time.monotonic() + self._gap_s
         if self._hang_ups.is_known:
             self.close()  # the peer is about to, and the next request is not to meet that
 
-    def _closed_by_peer(self) -> bool:
+    def _close_after_peer(self) -> bool:
         """Close what it has closed; whether it did after one reply."""
         self.close()
-        return not self._is_kept and self._hang_ups.closed()
+        return not self._is_kept and self._hang_ups.note_close()
 
     def _quarantine(self) -> None:
         self._free_s = time.monotonic() + self._timeout_s + _MARGIN_S
@@ -206,6 +206,6 @@ def _discard(link: ByteLink) -> None:
         pass
 
 
-def _size(heard: bytes) -> int:
+def _count_characters(heard: bytes) -> int:
     """Characters but flow control."""
     return len(heard.translate(None, _FLOW_CONTROL))

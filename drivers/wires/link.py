@@ -13,7 +13,7 @@ from typing import Protocol
 
 import serial
 
-from thermostand.foundation.addresses import SerialPlace, TcpPlace, place_of, stated
+from thermostand.foundation.addresses import SerialEndpoint, TcpEndpoint, get_display_address, parse_address
 from thermostand.foundation.errors import Unreachable
 
 _CONNECT_S = 1.0  # round number; nothing was measured
@@ -51,10 +51,10 @@ class SerialSettings:
 def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
     """Open `serial:PATH` (exclusively) or `tcp:HOST:PORT` for `device`; raises Unreachable, or ValueError when
     `address` is neither."""
-    place = place_of(address)
-    if isinstance(place, SerialPlace):
-        return _SerialLink(device, place.path, stated(address).removeprefix("serial:"), settings)
-    return _TcpLink(device, place, stated(address).removeprefix("tcp:"))
+    place = parse_address(address)
+    if isinstance(place, SerialEndpoint):
+        return _SerialLink(device, place.path, get_display_address(address).removeprefix("serial:"), settings)
+    return _TcpLink(device, place, get_display_address(address).removeprefix("tcp:"))
 
 
 class _SerialLink:
@@ -76,11 +76,11 @@ class _SerialLink:
                 exclusive=True,
             )
         except (OSError, termios.error) as error:
-            raise Unreachable(device, f"cannot open {where}: {why_closed(error)}") from error
+            raise Unreachable(device, f"cannot open {where}: {explain_closed(error)}") from error
 
     def write(self, data: bytes) -> None:
         try:
-            if rest := data[_taken_at_once(self._port.fileno(), data) :]:
+            if rest := data[_write_at_once(self._port.fileno(), data) :]:
                 self._port.write(rest)  # waits for room
         except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
@@ -104,7 +104,7 @@ class _SerialLink:
             self._port.close()
 
 
-def _taken_at_once(port: int, data: bytes) -> int:
+def _write_at_once(port: int, data: bytes) -> int:
     """How many bytes the port has room for."""
     try:
         return os.write(port, data)
@@ -136,7 +136,7 @@ class HangUps:
         if self._replies > 1:
             self._in_a_row, self._is_cleared = 0, True
 
-    def closed(self) -> bool:
+    def note_close(self) -> bool:
         """The peer has closed it; whether it did after one reply, so that a read may be asked over another one."""
         if self._replies != 1:
             return False
@@ -145,7 +145,7 @@ class HangUps:
         return True
 
 
-def why_closed(error: Exception) -> str:
+def explain_closed(error: Exception) -> str:
     """Why a port cannot be opened, in one clause: the words of pyserial have its name twice."""
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EAGAIN, errno.EBUSY):
@@ -154,7 +154,7 @@ def why_closed(error: Exception) -> str:
 
 
 class _TcpLink:
-    def __init__(self, device: str, place: TcpPlace, where: str) -> None:
+    def __init__(self, device: str, place: TcpEndpoint, where: str) -> None:
         self._device = device
         self._where = where
         try:

@@ -24,10 +24,16 @@ from pymodbus.framer.rtu import FramerRTU
 from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.register_message import WriteMultipleRegistersRequest, WriteSingleRegisterRequest
 
-from thermostand.drivers.wires.link import CLOSING_S, HangUps, why_closed
+from thermostand.drivers.wires.link import CLOSING_S, HangUps, explain_closed
 from thermostand.drivers.wires.modbus_messages import READS, REPLIES, Decoder, WriteCoilWord
 from thermostand.drivers.wires.registers import Space
-from thermostand.foundation.addresses import ByteAddress, SerialPlace, TcpPlace, place_of, stated
+from thermostand.foundation.addresses import (
+    ByteAddress,
+    SerialEndpoint,
+    TcpEndpoint,
+    get_display_address,
+    parse_address,
+)
 from thermostand.foundation.documents import Document
 
 # Every fault is raised and counted here; pymodbus would print it a second time on stderr.
@@ -129,7 +135,7 @@ class TcpClient(ModbusTcpClient):
         deadline_s, heard = time.monotonic() + timeout_s, b""
         while data := self.recv(None):
             heard = trace(False, heard + data)
-            if foreign := _foreign(packet, heard):
+            if foreign := _explain_foreign(packet, heard):
                 raise WireFault(FaultKind.GARBLED, foreign)
             if _is_reply(packet, heard) and (reply := self.framer.decoder.decode(heard[_HEAD:])) is not None:
                 return reply
@@ -187,7 +193,7 @@ def _is_reply(packet: bytes, heard: bytes) -> bool:
     return is_whole and heard[:4] == packet[:4] and heard[6] == packet[6]
 
 
-def _foreign(packet: bytes, heard: bytes) -> str:
+def _explain_foreign(packet: bytes, heard: bytes) -> str:
     """Why what was heard answers another request than this one, or is of another protocol; "" when it may be its
     reply."""
     is_rtu = heard[:4] != packet[:4] and heard[:1] == packet[6:7] and len(heard) > _SHORTEST_RTU
@@ -208,9 +214,9 @@ class ModbusClient:
 
     def __init__(self, settings: BusSettings) -> None:
         self._settings = settings
-        self._place = place_of(settings.address)
-        self._where = stated(settings.address)
-        self.serial = isinstance(self._place, SerialPlace)
+        self._place = parse_address(settings.address)
+        self._where = get_display_address(settings.address)
+        self.serial = isinstance(self._place, SerialEndpoint)
         self._client: SerialClient | TcpClient | None = None
         self.hang_ups = 0  # connections that the peer had closed before the next request
         self._manners = HangUps()
@@ -230,25 +236,25 @@ class ModbusClient:
             client.connect()
         except (OSError, termios.error) as error:
             client.close()
-            text = f"cannot open {self._where}: {why_closed(error)}"
+            text = f"cannot open {self._where}: {explain_closed(error)}"
             raise WireFault(FaultKind.LINE_DOWN, text) from error
         self._client = client
         self._manners.opened()
 
-    def _see_hang_up(self, request: ModbusPDU) -> None:
+    def _close_hung_up(self, request: ModbusPDU) -> None:
         """Let go of a connection that its gateway has closed. One that may close each after a reply is given a moment
         for it before the first write."""
         if not isinstance(self._client, TcpClient):
             return
         is_read = request.function_code in _READS
         if self._client.is_closed(0.0 if is_read or not self._manners.is_suspect else CLOSING_S):
-            self._manners.closed()
+            self._manners.note_close()
             self.hang_ups += 1
             self.close()
 
     def _make(self) -> SerialClient | TcpClient:
         settings, place = self._settings, self._place
-        if isinstance(place, TcpPlace):
+        if isinstance(place, TcpEndpoint):
             return TcpClient(
                 place.host, port=place.port, timeout=settings.timeout_s, retries=0, trace_packet=self._trace
             )
@@ -299,16 +305,16 @@ class ModbusClient:
         if self.serial and self._heard.startswith(self._sent):
             raise WireFault(FaultKind.GARBLED, "the request came back (local echo of the adapter?)")
         if space in ("holding", "input"):
-            return _exactly(list(reply.registers), count, count)
-        return _exactly([int(bit) for bit in reply.bits], -(-count // 8) * 8, count)
+            return _check_length(list(reply.registers), count, count)
+        return _check_length([int(bit) for bit in reply.bits], -(-count // 8) * 8, count)
 
     def write_register(self, unit: int, address: int, value: int) -> None:
         """FC 06."""
-        self._echoed(WriteSingleRegisterRequest(dev_id=unit, address=address, registers=[value]))
+        self._send_single_write(WriteSingleRegisterRequest(dev_id=unit, address=address, registers=[value]))
 
     def write_coil(self, unit: int, address: int, raw_value: int) -> None:
         """FC 05 with any 16-bit value."""
-        self._echoed(WriteCoilWord(dev_id=unit, address=address, registers=[raw_value]))
+        self._send_single_write(WriteCoilWord(dev_id=unit, address=address, registers=[raw_value]))
 
     def write_registers(self, unit: int, address: int, values: Sequence[int]) -> None:
         """FC 16."""
@@ -319,7 +325,7 @@ class ModbusClient:
                 f"wrote {len(values)} words at {address:#06x}, the reply has {reply.count} at {reply.address:#06x}",
             )
 
-    def _echoed(self, request: ModbusPDU) -> None:
+    def _send_single_write(self, request: ModbusPDU) -> None:
         """Send a single write, whose reply repeats address and value, and so is as long as the request."""
         reply = self._exchange(request)
         if len(self._heard) != len(self._sent):
@@ -333,7 +339,7 @@ class ModbusClient:
 
     def _exchange(self, request: ModbusPDU) -> ModbusPDU:
         """Send `request`; its reply, of the same function and unit; raises WireFault."""
-        self._see_hang_up(request)
+        self._close_hung_up(request)
         self.connect()
         reply = self._execute(request)
         self._manners.answered()
@@ -374,7 +380,7 @@ class ModbusClient:
         return data
 
 
-def _exactly(values: list[int], expected: int, count: int) -> list[int]:
+def _check_length(values: list[int], expected: int, count: int) -> list[int]:
     """The first `count` of `values`, of which there must be `expected`: another length answers another request."""
     if len(values) != expected:
         raise WireFault(FaultKind.GARBLED, f"asked for {count} values, got {len(values)}")

@@ -50,7 +50,7 @@ class WriteCoilWord(ModbusPDU):
         self.registers = [value]
 
 
-def _strict(reply: type[ModbusPDU]) -> type[ModbusPDU]:
+def _make_strict(reply: type[ModbusPDU]) -> type[ModbusPDU]:
     """`reply` with a byte count that must be that of its data: pymodbus takes bits whatever it says, and registers with
     one byte too many, one after the other."""
     has_words = reply in (ReadHoldingRegistersResponse, ReadInputRegistersResponse)
@@ -80,7 +80,7 @@ REPLIES = (
     WriteCoilWord,
     _RegistersWritten,
     *map(
-        _strict,
+        _make_strict,
         (ReadCoilsResponse, ReadDiscreteInputsResponse, ReadHoldingRegistersResponse, ReadInputRegistersResponse),
     ),
 )

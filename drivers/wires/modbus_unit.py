@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from thermostand.drivers.settings import Identity, same_device
+from thermostand.drivers.settings import Identity, check_same_device
 from thermostand.drivers.wires.bus import Bus
 from thermostand.drivers.wires.registers import (
     IdentityPoint,
@@ -95,7 +95,7 @@ class ModbusUnit:
                 raise DeviceFault(
                     self.name, f"{probe.point} is {found:g} where the register map expects {probe.expect:g}; not used"
                 )
-        self.identity = same_device(self.name, await self._read_identity(), self.identity)
+        self.identity = check_same_device(self.name, await self._read_identity(), self.identity)
 
     async def _read_identity(self) -> Identity:
         """What the unit tells of itself; vendor and model are otherwise those of the map."""
@@ -141,7 +141,7 @@ class ModbusUnit:
         async def holds() -> bool:
             return await self._bus.read(self.name, self._unit, point.space, point.address, point.words) == words
 
-        await self.checked(send, holds, f"{point_name} = {value:g} {point.unit}")
+        await self.send_and_check(send, holds, f"{point_name} = {value:g} {point.unit}")
         return decode(point, words).value
 
     async def write_coil(self, address: int, raw_value: int) -> None:
@@ -169,9 +169,9 @@ class ModbusUnit:
                     return True
             return False
 
-        await self.checked(send, holds, f"command {command_name}")
+        await self.send_and_check(send, holds, f"command {command_name}")
 
-    async def checked(
+    async def send_and_check(
         self, send: Callable[[], Awaitable[None]], holds: Callable[[], Awaitable[bool]], what: str
     ) -> None:
         """Send, then see that it holds. Only when its reply was lost and it does not hold is it sent once more."""
@@ -200,7 +200,7 @@ def is_confirmed(command: RegisterCommand, snapshot: Snapshot) -> bool:
     return snapshot.bits[confirm.bit] == confirm.is_
 
 
-def objection(check: InForceCheck, snapshot: Snapshot) -> str:
+def find_objection(check: InForceCheck, snapshot: Snapshot) -> str:
     """Why the set-point that was written is not the one that acts, by a snapshot that has read the points of the check;
     "" when this one does not object."""
     if check.bit:
@@ -211,8 +211,8 @@ def objection(check: InForceCheck, snapshot: Snapshot) -> str:
     if wanted is None or abs(found.value - wanted) <= (check.within if check.follows else 0.0):
         return ""
     shown = found.reason or f"{found.value:g}"
-    beside = f", {check.follows} {wanted:g}" if check.follows else ""
-    return f"{check.says} ({check.point} is {shown}{beside})"
+    folder = f", {check.follows} {wanted:g}" if check.follows else ""
+    return f"{check.says} ({check.point} is {shown}{folder})"
 
 
 def plan_blocks(register_map: RegisterMap, names: Iterable[str]) -> tuple[Block, ...]:
@@ -266,7 +266,7 @@ def decode(point: Point, words: list[int]) -> Sample:
     for fault in point.faults:
         if raw == fault.raw:
             return Sample(raw, math.nan, fault.code)
-    number = _number(point.type, raw)
+    number = _to_number(point.type, raw)
     if point.type == "float32" and 0 < abs(number) < _SMALLEST:
         return Sample(raw, math.nan, f"{number:g} is no measurement; is word_order {point.word_order} right?")
     value = number * point.scale + point.offset
@@ -277,7 +277,7 @@ def decode(point: Point, words: list[int]) -> Sample:
     return Sample(raw, value)
 
 
-def _number(kind: PointType, raw: int) -> float:
+def _to_number(kind: PointType, raw: int) -> float:
     """What the raw word or words stand for."""
     match kind:
         case "int16":

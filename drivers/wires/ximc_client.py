@@ -92,7 +92,7 @@ class XimcClient:
         except Unreachable:
             self.close()
             raise
-        raise self._complaint(letters, frame)
+        raise self._make_error(letters, frame)
 
     def _receive(self, link: ByteLink, letters: str, reply_size: int) -> tuple[XimcFrame | None, bytes, bool]:
         """The first frame, what came with it, and whether zeros came before it; no frame when none was complete in
@@ -118,7 +118,7 @@ class XimcClient:
                     return
         raise Unreachable(self._device, "the controller does not answer, nor does it echo zeros")
 
-    def _complaint(self, letters: str, frame: XimcFrame | None) -> DeviceError:
+    def _make_error(self, letters: str, frame: XimcFrame | None) -> DeviceError:
         """What was wrong with the answer to `letters`."""
         if frame is None:
             return Unreachable(self._device, f"no answer to {letters} within {self._timeout_s:g} s")

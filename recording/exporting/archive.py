@@ -20,13 +20,13 @@ from typing import cast
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import make_durable_folder, replace_file, sync_folder
-from thermostand.foundation.json_values import json_object
+from thermostand.foundation.json_values import parse_json_object
 from thermostand.foundation.lock_file import try_lock
-from thermostand.recording.format.inventory import SegmentState, inventory
+from thermostand.recording.format.inventory import SegmentState, list_segments
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
-from thermostand.recording.reading.catalogue import DELETED, ListedSession, contents_of
+from thermostand.recording.reading.catalogue import DELETED, ListedSession, compute_contents_digest
 from thermostand.recording.reading.notes import NOTES_NAME, Archived, add_archived
-from thermostand.recording.reading.run_word import Files, RunOutcome
+from thermostand.recording.reading.run_status import Files, RunOutcome
 
 MANIFEST = "archive.json"
 KEEP_TAG = "keep"  # a session with this tag is never deleted
@@ -38,7 +38,7 @@ Report = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class DeletionRule:
     """What may be deleted: sound, with a copy as it is now, without KEEP_TAG, ended at least after_days ago."""
 
     after_days: float
@@ -56,7 +56,7 @@ class Rule:
         return bool(is_old and entry.archived and entry.files == Files.SOUND and KEEP_TAG not in entry.tags)
 
 
-def unfit(entry: ListedSession) -> str:
+def explain_unfit(entry: ListedSession) -> str:
     """Why a session is not copied now; "" when it may be."""
     if any(state in (SegmentState.RECORDING, SegmentState.UNFINISHED) for _, state, _ in entry.segments):
         return "is being recorded, or was never finished (`stand session repair`)"
@@ -67,27 +67,29 @@ def archive(entry: ListedSession, to: Path, by: str, now_ns: int, report: Report
     """A verified copy of the session in `to`, and a line in its notes that says so; returns the copy. `report` gets the
     bytes done, of twice the session's size. Blocking. SessionError when it cannot be made; what is there is kept for
     the next try."""
-    if reason := unfit(entry):
+    if reason := explain_unfit(entry):
         raise SessionError(f"{entry.path}: {reason}")
     copy, part = to / entry.name, to / f"{entry.name}.part"
     try:
-        contents = contents_of(entry.path)
+        contents = compute_contents_digest(entry.path)
         if not _is_copy(copy, contents):
             if os.path.lexists(copy):
                 raise SessionError(f"{copy}: is there already and is another session, or an older state of this one")
             make_durable_folder(part)
-            _check_room(entry, to, part)
-            _clear(part, set(_files(entry.path)))
-            sums = {name: _copied(entry.path / name, part / name, report) for name in sorted(_files(entry.path))}
+            _check_space(entry, to, part)
+            _remove_extra(part, set(_list_files(entry.path)))
+            sums = {
+                name: _copy_file(entry.path / name, part / name, report) for name in sorted(_list_files(entry.path))
+            }
             _check_same(part, sums, report)
-            if contents_of(entry.path) != contents:
+            if compute_contents_digest(entry.path) != contents:
                 raise SessionError(f"{entry.path}: has changed while it was copied; try again")
             manifest = {"contents": contents, "session": entry.name, "blake2b": sums}
             replace_file(part / MANIFEST, json.dumps(manifest, indent=1).encode())
             part.rename(copy)
             sync_folder(to)
         add_archived(entry.path, Archived(str(copy.resolve()), now_ns, contents), by)
-        _copied(entry.path / NOTES_NAME, copy / NOTES_NAME, lambda _: None)
+        _copy_file(entry.path / NOTES_NAME, copy / NOTES_NAME, lambda _: None)
     except OSError as error:
         raise SessionError(f"{copy}: the copy failed ({error.strerror or error})") from error
     return copy
@@ -96,7 +98,7 @@ def archive(entry: ListedSession, to: Path, by: str, now_ns: int, report: Report
 def check_copy(copy: Path, contents: str, report: Report = lambda _: None) -> None:
     """Read a copy back; SessionError when a byte of it is not what the session had."""
     try:
-        sums = _manifest(copy).get("blake2b")
+        sums = _read_manifest(copy).get("blake2b")
         if not _is_copy(copy, contents) or not isinstance(sums, dict):
             raise SessionError(f"{copy}: is not a complete copy")
         _check_same(copy, cast("dict[str, str]", sums), report)
@@ -110,8 +112,8 @@ def delete(entry: ListedSession, report: Report = lambda _: None) -> None:
     check_copy(Path(entry.archived), entry.contents, report)
     gone = entry.path.with_name(f".{entry.path.name}{DELETED}")
     try:
-        with closing(_Locked(entry.path)):
-            if contents_of(entry.path) != entry.contents or unfit(entry) or entry.path.is_symlink():
+        with closing(_JournalLock(entry.path)):
+            if compute_contents_digest(entry.path) != entry.contents or explain_unfit(entry) or entry.path.is_symlink():
                 raise SessionError(f"{entry.path}: has changed since it was copied; it is kept")
             entry.path.rename(gone)
         shutil.rmtree(gone)
@@ -119,7 +121,7 @@ def delete(entry: ListedSession, report: Report = lambda _: None) -> None:
         raise SessionError(f"{entry.path}: cannot be deleted ({error.strerror or error})") from error
 
 
-class _Locked:
+class _JournalLock:
     """The journal's lock, as a daemon has it that runs or resumes the session; SessionError when one has it."""
 
     def __init__(self, path: Path) -> None:
@@ -129,7 +131,7 @@ class _Locked:
             if not try_lock(self._fd):
                 self.close()
                 raise SessionError(f"{path}: a daemon has this session open; it is kept")
-        if any(file.state is SegmentState.RECORDING for file in inventory(path)):
+        if any(file.state is SegmentState.RECORDING for file in list_segments(path)):
             self.close()
             raise SessionError(f"{path}: is being recorded; it is kept")
 
@@ -139,7 +141,7 @@ class _Locked:
             self._fd = -1
 
 
-def _files(directory: Path) -> Iterator[str]:
+def _list_files(directory: Path) -> Iterator[str]:
     """The regular files of a session, by their paths within it, but for its notes, which still grow."""
     for folder, _, names in os.walk(directory):
         for name in names:
@@ -150,48 +152,48 @@ def _files(directory: Path) -> Iterator[str]:
 
 def _is_copy(copy: Path, contents: str) -> bool:
     """By names and sizes."""
-    return copy.is_dir() and _manifest(copy).get("contents") == contents == contents_of(copy)
+    return copy.is_dir() and _read_manifest(copy).get("contents") == contents == compute_contents_digest(copy)
 
 
-def _manifest(copy: Path) -> dict[str, object]:
+def _read_manifest(copy: Path) -> dict[str, object]:
     try:
-        return json_object((copy / MANIFEST).read_bytes()) or {}
+        return parse_json_object((copy / MANIFEST).read_bytes()) or {}
     except OSError:
         return {}
 
 
-def _clear(part: Path, wanted: set[str]) -> None:
+def _remove_extra(part: Path, wanted: set[str]) -> None:
     """Take out of a copy that is begun what the session does not have (any more)."""
     for path in [path for path in part.rglob("*") if not path.is_dir() and str(path.relative_to(part)) not in wanted]:
         path.unlink()
 
 
-def _check_room(entry: ListedSession, to: Path, part: Path) -> None:
-    there = sum(path.stat().st_size for path in part.rglob("*") if path.is_file())
-    needed, free = entry.size_bytes - there + _SPARE_BYTES, shutil.disk_usage(to).free
+def _check_space(entry: ListedSession, to: Path, part: Path) -> None:
+    existing_bytes = sum(path.stat().st_size for path in part.rglob("*") if path.is_file())
+    needed, free = entry.size_bytes - existing_bytes + _SPARE_BYTES, shutil.disk_usage(to).free
     if needed > free:
         raise SessionError(f"{to}: has {free / 1e9:.1f} GB free, and {entry.name} needs {needed / 1e9:.1f} GB")
 
 
-def _copied(source: Path, target: Path, report: Report) -> str:
+def _copy_file(source: Path, target: Path, report: Report) -> str:
     """Copy one file, synced, under its name when it is complete; the checksum of what was read of the source. A file of
     the same size that an earlier try has left is not copied again: it is compared with the others."""
     if not source.is_file():
         return ""
-    is_there = target.is_file() and target.stat().st_size == source.stat().st_size and target.name != NOTES_NAME
+    is_present = target.is_file() and target.stat().st_size == source.stat().st_size and target.name != NOTES_NAME
     make_durable_folder(target.parent)
     growing = target.with_name(f".{target.name}.copying")
     digest = hashlib.blake2b(digest_size=16)
-    with source.open("rb") as read, open(os.devnull if is_there else growing, "wb") as written:
+    with source.open("rb") as read, open(os.devnull if is_present else growing, "wb") as written:
         while block := read.read(_BLOCK_BYTES):
             digest.update(block)
             written.write(block)
             report(len(block))
         os.posix_fadvise(read.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # a night must not push out what a run needs
-        if not is_there:
+        if not is_present:
             written.flush()
             os.fsync(written.fileno())
-    if not is_there:
+    if not is_present:
         status = source.stat()
         os.utime(growing, ns=(status.st_atime_ns, status.st_mtime_ns))
         growing.replace(target)

@@ -25,11 +25,11 @@ from contextlib import closing
 from pathlib import Path
 
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.files import new_folder
-from thermostand.recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, frame_facts, sidecar_text
+from thermostand.foundation.files import create_folder
+from thermostand.recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, format_sidecar, list_frame_facts
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
 from thermostand.recording.exporting.telemetry_tables import TIME_COLUMNS, write_telemetry
-from thermostand.recording.format.decoded_items import frame_of
+from thermostand.recording.format.decoded_items import decode_frame
 from thermostand.recording.format.images import encode_png
 from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.session import Session
@@ -88,8 +88,8 @@ def export(
     if telemetry is not None:
         check_format(telemetry)
     read = (*(session.telemetry_segments if telemetry is not None else ()), *(session.frame_segments if frames else ()))
-    work = _Work(read, report)
-    with new_folder(out) as folder:
+    work = _ExportProgress(read, report)
+    with create_folder(out) as folder:
         _write_facts(session, folder)
         if telemetry is not None:
             write_telemetry(session, folder / "telemetry", telemetry, work.done)
@@ -100,7 +100,7 @@ def export(
         _write_originals(session, folder / "originals")
 
 
-class _Work:
+class _ExportProgress:
     """How far the export is, by the bytes of the segments it reads."""
 
     def __init__(self, segments: Sequence[Path], report: Callable[[float, str], None]) -> None:
@@ -130,7 +130,7 @@ def _write_facts(session: Session, folder: Path) -> None:
         folder / "steps.csv",
         STEP_COLUMNS,
         (
-            (m.time_ns, utc.utc_ns(m.time_ns), m.step_id, m.index, m.kind, m.state.value, _json(m.parameters))
+            (m.time_ns, utc.utc_ns(m.time_ns), m.step_id, m.index, m.kind, m.state.value, _serialise(m.parameters))
             for m in session.steps()
         ),
     )
@@ -138,15 +138,15 @@ def _write_facts(session: Session, folder: Path) -> None:
         folder / "events.csv",
         EVENT_COLUMNS,
         (
-            (e.time_ns, utc.utc_ns(e.time_ns), e.level, e.kind, e.text, _json(e.data) if e.data else "")
+            (e.time_ns, utc.utc_ns(e.time_ns), e.level, e.kind, e.text, _serialise(e.data) if e.data else "")
             for e in session.events()
         ),
     )
-    if rows := list(_note_rows(session)):
+    if rows := list(_iterate_note_rows(session)):
         _write_csv(folder / "notes.csv", NOTE_COLUMNS, rows)
 
 
-def _note_rows(session: Session) -> Iterator[Sequence[Cell]]:
+def _iterate_note_rows(session: Session) -> Iterator[Sequence[Cell]]:
     said = read_notes(session.path)
     for note in said.notes:
         yield (note.time_ns, note.by, "note", note.text)
@@ -154,7 +154,7 @@ def _note_rows(session: Session) -> Iterator[Sequence[Cell]]:
         yield (None, None, "tag", tag)
 
 
-def _json(fields: Mapping[str, object]) -> str:
+def _serialise(fields: Mapping[str, object]) -> str:
     return json.dumps(dict(fields), sort_keys=True, ensure_ascii=False)
 
 
@@ -164,22 +164,22 @@ def _write_csv(path: Path, columns: Sequence[Column], rows: Iterable[Sequence[Ce
             table.add(row)
 
 
-def _write_frames(session: Session, folder: Path, work: _Work) -> None:
+def _write_frames(session: Session, folder: Path, work: _ExportProgress) -> None:
     folder.mkdir()
     stand = StandTemperatures(session)
     with closing(CsvTable(folder / "index.csv", (*SIDECAR_COLUMNS, *stand.columns))) as index:
         for number, image in enumerate(session.images(), 1):
             name = f"{number:06d}"
-            facts = (*frame_facts(f"{name}.png", image.meta, session.utc), *stand.at(image.time_ns))
-            (folder / f"{name}.png").write_bytes(encode_png(frame_of(image).image))
-            (folder / f"{name}.txt").write_text(sidecar_text(stand.columns, facts), encoding="utf-8")
+            facts = (*list_frame_facts(f"{name}.png", image.meta, session.utc), *stand.read_at(image.time_ns))
+            (folder / f"{name}.png").write_bytes(encode_png(decode_frame(image).image))
+            (folder / f"{name}.txt").write_text(format_sidecar(stand.columns, facts), encoding="utf-8")
             index.add(facts)
             work.done(image.stored_bytes, f"frame {number} of {session.frame_count}")
 
 
 def _write_frames_table(session: Session, folder: Path, has_images: bool, table_format: TableFormat) -> None:
     names = [f"frames/{number:06d}.png" for number in range(1, session.frame_count + 1)] if has_images else None
-    columns, rows = frames_rows(session, names)
+    columns, rows = make_frames_rows(session, names)
     with closing(TABLES[table_format](folder / f"frames.{table_format}", columns)) as table:
         for row in rows:
             table.add(row)
@@ -208,7 +208,9 @@ _FIRST = (
 )
 
 
-def frames_rows(session: Session, file_of: Sequence[str] | None) -> tuple[tuple[Column, ...], Iterator[Sequence[Cell]]]:
+def make_frames_rows(
+    session: Session, file_of: Sequence[str] | None
+) -> tuple[tuple[Column, ...], Iterator[Sequence[Cell]]]:
     """The columns and the rows of F frames in order of time. file_of: F names of exported images; without them `file`
     is the segment that has the image."""
     table, stand = session.frames_table(), StandTemperatures(session)
@@ -229,7 +231,7 @@ def frames_rows(session: Session, file_of: Sequence[str] | None) -> tuple[tuple[
                 float(table.chamber_degC[place]),
                 float(table.camera_degC[place]),
                 str(table.flags[place]),
-                *stand.at(time_ns),
+                *stand.read_at(time_ns),
                 *(float(column[place]) for column in table.positions.values()),
             )
 

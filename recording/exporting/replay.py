@@ -15,15 +15,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock, VirtualClock, WallClock
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.files import new_folder
+from thermostand.foundation.files import create_folder
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
+from thermostand.foundation.workers import WorkerThread
 from thermostand.recording.exporting.topics import recorded_devices
-from thermostand.recording.format.holes import holes_text
+from thermostand.recording.format.holes import format_holes
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
@@ -70,9 +70,9 @@ async def replay(session: Session, hub: Hub, clock: Clock) -> None:
     first item that cannot be read.
     """
     items = session.published()
-    lane = Lane("replay", clock)
+    lane = WorkerThread("replay", clock)
     try:
-        while portion := await lane.call(_portion, items):
+        while portion := await lane.call(_take_portion, items):
             for time_ns, item in portion:
                 await clock.sleep_until(time_ns)
                 hub.publish(item)
@@ -80,7 +80,7 @@ async def replay(session: Session, hub: Hub, clock: Clock) -> None:
         lane.close()
 
 
-def _portion(items: Iterator[tuple[int, Item]]) -> list[tuple[int, Item]]:
+def _take_portion(items: Iterator[tuple[int, Item]]) -> list[tuple[int, Item]]:
     """The next items, up to and with a frame; none at the end."""
     portion: list[tuple[int, Item]] = []
     for time_ns, item in items:
@@ -107,17 +107,17 @@ async def replay_and_record(
     clock = VirtualClock(first_ns) if speed is None else ReplayClock(first_ns, speed)
     hub = Hub()
     watch(hub)
-    settings = _settings(VIRTUAL_COMMIT_S if speed is None else speed)
+    settings = _make_settings(VIRTUAL_COMMIT_S if speed is None else speed)
     info = SessionInfo.of(session.metadata)
     if session.holes:
-        info = replace(info, holes=holes_text(session.holes))
-    with new_folder(out) as folder:
+        info = replace(info, holes=format_holes(session.holes))
+    with create_folder(out) as folder:
         devices = recorded_devices(session.telemetry_segments)
         recorder = Recorder(folder, info, session.attachments, devices, hub, clock, settings=settings)
         recorder.start()
         background = [recorder.run()] + ([clock.run()] if isinstance(clock, VirtualClock) else [])
         try:
-            await _beside(replay(session, hub, clock), background)
+            await _run_with_background(replay(session, hub, clock), background)
         finally:
             _copy_journal(session, folder)  # before the manifest is written last, which has its hash
             await recorder.finish()
@@ -128,7 +128,9 @@ async def replay_and_record(
     return out
 
 
-async def _beside(work: Coroutine[Any, Any, None], background: Sequence[Coroutine[Any, Any, None]]) -> None:
+async def _run_with_background(
+    work: Coroutine[Any, Any, None], background: Sequence[Coroutine[Any, Any, None]]
+) -> None:
     """Await `work`, but raise at once what the background raises; nothing runs on when this returns."""
     tasks = [asyncio.create_task(coroutine) for coroutine in (work, *background)]
     try:
@@ -148,6 +150,6 @@ def _copy_journal(session: Session, folder: Path) -> None:
         shutil.copyfile(journal, folder / JOURNAL_NAME)
 
 
-def _settings(commit_s: float) -> RecordingSettings:
+def _make_settings(commit_s: float) -> RecordingSettings:
     """Without the rules of a stand for a nearly full disk: a copy may fill it, and says nothing of it."""
     return RecordingSettings(telemetry_commit_s=commit_s, stop_frames_below_bytes=0, alert_below_fraction=0.0)

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.instants import utc_text
+from thermostand.foundation.instants import format_utc
 from thermostand.recording.exporting.tables import Cell, Column
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import windows_of
+from thermostand.recording.format.images import decode_windows
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
@@ -34,9 +34,9 @@ SIDECAR_COLUMNS = (
 )
 
 
-def frame_facts(file: str, meta: messages.FrameMeta, utc: UtcOffsets) -> tuple[Cell, ...]:
+def list_frame_facts(file: str, meta: messages.FrameMeta, utc: UtcOffsets) -> tuple[Cell, ...]:
     """The cells of SIDECAR_COLUMNS. windows_px: `x,y,width,height;...` of a frame of which only these are real."""
-    windows = windows_of(meta)
+    windows = decode_windows(meta)
     return (
         file,
         utc.utc_ns(meta.time_ns),
@@ -55,11 +55,11 @@ def frame_facts(file: str, meta: messages.FrameMeta, utc: UtcOffsets) -> tuple[C
     )
 
 
-def sidecar_text(stand_columns: Sequence[Column], facts: Sequence[Cell]) -> str:
+def format_sidecar(stand_columns: Sequence[Column], facts: Sequence[Cell]) -> str:
     """A line `name: value` for each fact, the unit in the name; an unknown number is nan, an unknown text empty."""
     lines: list[str] = []
     for column, cell in zip((*SIDECAR_COLUMNS, *stand_columns), facts, strict=True):
-        text = utc_text(int(cell or 0)) if column.type == "utc" else "" if cell is None else str(cell)
+        text = format_utc(int(cell or 0)) if column.type == "utc" else "" if cell is None else str(cell)
         lines.append(f"{column.name}: {text}".rstrip())
     return "\n".join(lines) + "\n"
 
@@ -84,7 +84,7 @@ class StandTemperatures:
             column for name in names for column in (Column(f"{name}_degC", "value"), Column(f"{name}_age_s", "value"))
         )
 
-    def at(self, time_ns: int) -> tuple[float, ...]:
+    def read_at(self, time_ns: int) -> tuple[float, ...]:
         """The cells of `columns` at that instant."""
         cells: list[float] = []
         for times_ns, values in self._readings:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 from thermostand.foundation.extras import import_extra
-from thermostand.foundation.instants import utc_text
+from thermostand.foundation.instants import format_utc
 
 TableFormat = Literal["csv", "parquet"]
 Cell = int | float | str | None
@@ -43,27 +43,27 @@ class TableWriter(Protocol):
 
 class CsvTable:
     """RFC 4180 in UTF-8 with a header line. A float is the shortest text that reads back as the same float, NaN is
-    `nan`; instants are ISO 8601. Texts are such as no spreadsheet takes for a formula (`plain_text`)."""
+    `nan`; instants are ISO 8601. Texts are such as no spreadsheet takes for a formula (`escape_cell`)."""
 
     def __init__(self, path: Path, columns: Sequence[Column]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file)
-        self._writer.writerow([plain_text(column.name) for column in columns])
+        self._writer.writerow([escape_cell(column.name) for column in columns])
         self._instants = [index for index, column in enumerate(columns) if column.type == "utc"]
 
     def add(self, row: Sequence[Cell]) -> None:
         """Write the row."""
         cells = list(row)
         for index in self._instants:
-            cells[index] = utc_text(int(row[index] or 0))
-        self._writer.writerow([plain_text(cell) if isinstance(cell, str) else cell for cell in cells])
+            cells[index] = format_utc(int(row[index] or 0))
+        self._writer.writerow([escape_cell(cell) if isinstance(cell, str) else cell for cell in cells])
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-def plain_text(text: str) -> str:
+def escape_cell(text: str) -> str:
     """The text of a cell with an apostrophe before what a spreadsheet would take for a formula (= + - @ at its
     beginning, spaces aside), and without control characters (tab and line feed become spaces): a session may come from
     anybody."""

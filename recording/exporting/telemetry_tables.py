@@ -14,9 +14,9 @@ from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Channel, Reading
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, TableFormat, TableWriter
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import READINGS, fields_of
-from thermostand.recording.format.decoded_items import item_of
-from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.format.batches import READINGS, name_fields
+from thermostand.recording.format.decoded_items import decode_item
+from thermostand.recording.format.records import read_telemetry_messages
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
@@ -42,30 +42,30 @@ def write_telemetry(
     """One table per device, in the order of the recording, and one of the frames' descriptions. `done` gets the bytes
     of each segment that has been read."""
     folder.mkdir()
-    channels = _channels(session)
+    channels = _collect_channels(session)
     tables: dict[str, TableWriter] = {}
     with ExitStack() as stack:
         for path in session.telemetry_segments:
-            for message in telemetry_messages(path, lambda channel: channel.topic.startswith(READINGS)):
-                batch = item_of(message)
+            for message in read_telemetry_messages(path, lambda channel: channel.topic.startswith(READINGS)):
+                batch = decode_item(message)
                 if not isinstance(batch, Batch):
                     continue
                 name = batch.device
                 if name not in tables:
-                    columns = _columns(channels[name])
+                    columns = _make_columns(channels[name])
                     tables[name] = TABLES[table_format](folder / f"{name}.{table_format}", columns)
                     stack.callback(tables[name].close)
-                for row in _batch_rows(channels[name], batch, session.utc):
+                for row in _iterate_batch_rows(channels[name], batch, session.utc):
                     tables[name].add(row)
             done(path.stat().st_size, f"telemetry {path.name}")
         if metas := session.frame_metas():
             described = TABLES[table_format](folder / f"camera_meta.{table_format}", META_COLUMNS)
             stack.callback(described.close)
             for meta in metas:
-                described.add(_described(meta, session.utc))
+                described.add(_make_meta_row(meta, session.utc))
 
 
-def _described(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
+def _make_meta_row(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
     return (
         meta.time_ns,
         utc.utc_ns(meta.time_ns),
@@ -81,7 +81,7 @@ def _described(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
     )
 
 
-def _channels(session: Session) -> dict[str, tuple[Channel, ...]]:
+def _collect_channels(session: Session) -> dict[str, tuple[Channel, ...]]:
     """What each device declares, then what it was read to measure besides."""
     found = {name: device.channels for name, device in recorded_devices(session.telemetry_segments).items()}
     for channel, unit in session.units().items():
@@ -91,29 +91,29 @@ def _channels(session: Session) -> dict[str, tuple[Channel, ...]]:
     return found
 
 
-def _columns(channels: tuple[Channel, ...]) -> tuple[Column, ...]:
+def _make_columns(channels: tuple[Channel, ...]) -> tuple[Column, ...]:
     """time_ns is the instant of the measurement; a value's unit is in its name."""
     values = [
         column
-        for field in fields_of(channels)
+        for field in name_fields(channels)
         for column in (Column(field, "value"), Column(f"{field}_quality", "word"))
     ]
     return (*TIME_COLUMNS, *values, Column("remarks", "text"))
 
 
-def _batch_rows(channels: Sequence[Channel], batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
+def _iterate_batch_rows(channels: Sequence[Channel], batch: Batch, utc: UtcOffsets) -> Iterator[Sequence[Cell]]:
     """A row for each instant at which something was measured, most often one."""
     keys = [(f"{batch.device}.{each.name}", each.unit) for each in channels]
-    for time_ns, readings in _by_instant(batch):
+    for time_ns, readings in _group_by_instant(batch):
         cells: list[Cell] = []
         for key in keys:
             reading = readings.get(key)
             cells += (None, None) if reading is None else (reading.value, reading.quality.value)
-        remarks = (_remark(reading, key in keys) for key, reading in readings.items())
+        remarks = (_format_remark(reading, key in keys) for key, reading in readings.items())
         yield (time_ns, utc.utc_ns(time_ns), *cells, "; ".join(filter(None, remarks)))
 
 
-def _by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Reading]]]:
+def _group_by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Reading]]]:
     """(time_ns, (channel, unit) -> reading), ascending; a channel read twice at one instant gives two of them."""
     readings: dict[tuple[str, str], Reading] = {}
     time_ns = 0
@@ -128,7 +128,7 @@ def _by_instant(batch: Batch) -> Iterator[tuple[int, dict[tuple[str, str], Readi
         yield time_ns, readings
 
 
-def _remark(reading: Reading, has_column: bool) -> str:
+def _format_remark(reading: Reading, has_column: bool) -> str:
     """The reason of a reading, and the reading itself when the table has no column for it; "" when there is neither."""
     if not has_column:
         value = f"{reading.channel} {reading.value!r} {reading.unit} {reading.quality.value}"

@@ -7,17 +7,17 @@ from dataclasses import replace
 
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import READINGS, batch_form
-from thermostand.recording.format.records import RecordedMessage, telemetry_messages
+from thermostand.recording.format.batches import READINGS, make_batch_schema
+from thermostand.recording.format.records import RecordedMessage, read_telemetry_messages
 from thermostand.recording.reading.recorded_devices import recorded_channels, recorded_devices
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import readings_topic
 from thermostand.recording.writing.segment import Topic
+from thermostand.recording.writing.session_spec import make_readings_topic
 
 
-def recorded_topics(session: Session) -> tuple[Topic, ...]:
+def list_topics(session: Session) -> tuple[Topic, ...]:
     """The topics of all telemetry segments in the order they were declared; SessionError when one is unknown."""
-    topics = {f"{READINGS}{name}": each for name, each in _readings_topics(session).items()}
+    topics = {f"{READINGS}{name}": each for name, each in _list_readings_topics(session).items()}
     for channel in recorded_channels(session.telemetry_segments):
         if channel.topic in topics:
             continue
@@ -27,19 +27,19 @@ def recorded_topics(session: Session) -> tuple[Topic, ...]:
     return tuple(topics.values())
 
 
-def _readings_topics(session: Session) -> dict[str, Topic]:
+def _list_readings_topics(session: Session) -> dict[str, Topic]:
     return {
-        name: readings_topic(batch_form(name, each))
+        name: make_readings_topic(make_batch_schema(name, each))
         for name, each in recorded_devices(session.telemetry_segments).items()
     }
 
 
-def recorded_messages(session: Session) -> Iterator[RecordedMessage]:
-    """The messages of the telemetry as `recorded_topics` has them: those of a device that was declared otherwise in a
+def iterate_recorded_messages(session: Session) -> Iterator[RecordedMessage]:
+    """The messages of the telemetry as `list_topics` has them: those of a device that was declared otherwise in a
     part of the session are encoded anew."""
-    forms = {name: batch_form(name, each) for name, each in recorded_devices(session.telemetry_segments).items()}
+    forms = {name: make_batch_schema(name, each) for name, each in recorded_devices(session.telemetry_segments).items()}
     for path in session.telemetry_segments:
-        for message in telemetry_messages(path, lambda channel: True):
+        for message in read_telemetry_messages(path, lambda channel: True):
             form = message.form
             if form is not None and form is not forms[form.name]:
                 whole = forms[form.name]

@@ -13,25 +13,25 @@ from pathlib import Path
 
 from mcap.writer import CompressionType
 
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import TRIMMED
-from thermostand.foundation.files import new_folder
+from thermostand.foundation.files import create_folder
 from thermostand.foundation.items import StepMark, StepState
-from thermostand.recording.exporting.topics import recorded_messages, recorded_topics
+from thermostand.recording.exporting.topics import iterate_recorded_messages, list_topics
 from thermostand.recording.format import messages
-from thermostand.recording.format.holes import holes_text
-from thermostand.recording.format.images import ZSTD_LEVEL, frame_topics
+from thermostand.recording.format.holes import format_holes
+from thermostand.recording.format.images import ZSTD_LEVEL, name_frame_topics
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
-from thermostand.recording.format.records import FramePlace, frame_places, read_frame
-from thermostand.recording.format.utc_offsets import offset_event
-from thermostand.recording.reading.run_word import Extent, extent_of
+from thermostand.recording.format.records import FramePlace, list_frame_places, read_frame
+from thermostand.recording.format.utc_offsets import make_offset_event
+from thermostand.recording.reading.run_status import Extent, parse_extent
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import frames_topic
 from thermostand.recording.writing.manifest_file import write_manifest
 from thermostand.recording.writing.recorder import RecordingSettings
-from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
+from thermostand.recording.writing.segment import MessageRecord, SeriesSpec, Topic
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import make_frames_topic
 
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
 BLOCK_NS = 60 * NS_PER_S
@@ -48,62 +48,64 @@ def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
     nothing lies before the part. SessionError when nothing
     was recorded in the range, or when reading or writing fails; `out` then does not appear.
     """
-    places = [place for place in _places(session) if begin_ns <= place.time_ns < end_ns]
-    kept = _kept(session, begin_ns, end_ns)
+    places = [place for place in _iterate_places(session) if begin_ns <= place.time_ns < end_ns]
+    kept = _select_records(session, begin_ns, end_ns)
     first = next(kept, None)
     if first is None and not places:
         raise SessionError(
             f"{session.path}: has nothing from {session.utc.date_time(begin_ns)} to {session.utc.local_text(end_ns)}; "
-            f"{_range(session)}"
+            f"{_describe_range(session)}"
         )
     first_ns = first.time_ns if first is not None else places[0].time_ns
-    telemetry = chain(_opening(session, first_ns, begin_ns, end_ns), [] if first is None else [first], kept)
-    metadata = _metadata(session, begin_ns, end_ns)
-    with new_folder(out) as folder:
+    telemetry = chain(_make_opening(session, first_ns, begin_ns, end_ns), [] if first is None else [first], kept)
+    metadata = _make_metadata(session, begin_ns, end_ns)
+    with create_folder(out) as folder:
         _write_telemetry(session, metadata, folder / TELEMETRY, telemetry, first_ns)
         _write_frames(session, metadata, folder / FRAMES, places)
         write_manifest(folder)
     return out
 
 
-def _metadata(session: Session, begin_ns: int, end_ns: int) -> dict[str, str]:
+def _make_metadata(session: Session, begin_ns: int, end_ns: int) -> dict[str, str]:
     """The session's record, with the extent and the holes of the part."""
-    before = extent_of(session.metadata)
+    before = parse_extent(session.metadata)
     if before is not None:  # a part of a part is one of the whole
         begin_ns, end_ns = max(begin_ns, before.begin_ns), min(end_ns, before.end_ns)
     extent = Extent(session.metadata.get("session_id", session.path.name), begin_ns, end_ns, session.run)
-    holes = [part for hole in session.holes if (part := hole.within(begin_ns, end_ns)) is not None]
-    extra = {"extent": extent.record(), "holes": holes_text(holes)}
+    holes = [part for hole in session.holes if (part := hole.clip(begin_ns, end_ns)) is not None]
+    extra = {"extent": extent.record(), "holes": format_holes(holes)}
     return {**session.metadata, **{name: text for name, text in extra.items() if text}}
 
 
-def _places(session: Session) -> Iterator[FramePlace]:
+def _iterate_places(session: Session) -> Iterator[FramePlace]:
     """The frames in the order of the recording."""
     for path in session.frame_segments:
-        yield from frame_places(path)
+        yield from list_frame_places(path)
 
 
-def _telemetry(session: Session) -> Iterator[MessageRecord]:
-    for message in recorded_messages(session):
+def _read_telemetry(session: Session) -> Iterator[MessageRecord]:
+    for message in iterate_recorded_messages(session):
         yield MessageRecord(message.topic, message.time_ns, message.data, message.sequence)
 
 
-def _kept(session: Session, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
-    return (record for record in _telemetry(session) if begin_ns <= record.time_ns < end_ns)
+def _select_records(session: Session, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
+    return (record for record in _read_telemetry(session) if begin_ns <= record.time_ns < end_ns)
 
 
-def _range(session: Session) -> str:
-    times_ns = [record.time_ns for record in _telemetry(session)] + [place.time_ns for place in _places(session)]
+def _describe_range(session: Session) -> str:
+    times_ns = [record.time_ns for record in _read_telemetry(session)] + [
+        place.time_ns for place in _iterate_places(session)
+    ]
     if not times_ns:
         return "it is empty"
     return f"it goes from {session.utc.date_time(min(times_ns))} to {session.utc.local_text(max(times_ns))}"
 
 
-def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
+def _make_opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
     """Where the part comes from, and the mark of the step under way."""
     name, utc = session.metadata.get("session_id", session.path.name), session.utc
     text = f"trimmed from session {name}: {utc.utc_text(begin_ns)} up to {utc.utc_text(end_ns)}, the end not included"
-    mark = _step_under_way(session, begin_ns)
+    mark = _find_step_under_way(session, begin_ns)
     if mark is not None:
         text += f"; the mark of step {mark.step_id}, started {utc.utc_text(mark.time_ns)}, is repeated at the start"
     event = TRIMMED.at(first_ns, text)
@@ -112,10 +114,10 @@ def _opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Ite
     if mark is not None:
         yield MessageRecord(messages.STEP, first_ns, messages.encode_step(mark))
     if offset_ns := utc.at(first_ns):
-        yield MessageRecord(messages.EVENT, first_ns, messages.encode_event(offset_event(first_ns, offset_ns)))
+        yield MessageRecord(messages.EVENT, first_ns, messages.encode_event(make_offset_event(first_ns, offset_ns)))
 
 
-def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:
+def _find_step_under_way(session: Session, begin_ns: int) -> StepMark | None:
     """The last step that started before `begin_ns` and did not end before it."""
     under_way: StepMark | None = None
     for mark in session.steps():
@@ -131,18 +133,18 @@ def _step_under_way(session: Session, begin_ns: int) -> StepMark | None:
 def _write_telemetry(
     session: Session, metadata: Mapping[str, str], folder: Path, records: Iterator[MessageRecord], first_ns: int
 ) -> None:
-    topics = {topic.name: topic for topic in recorded_topics(session)}
+    topics = {topic.name: topic for topic in list_topics(session)}
     for name in (messages.EVENT, messages.LOG, messages.STEP):
         topics.setdefault(name, Topic(name, messages.CLASSES[name]))
-    series = _series(session, metadata, folder, tuple(topics.values()), CompressionType.ZSTD)
+    series = _open_series(session, metadata, folder, tuple(topics.values()), CompressionType.ZSTD)
     now_ns = first_ns
-    for block in _blocks(records):
+    for block in _split_into_blocks(records):
         now_ns = max(now_ns, block[-1].time_ns)
         _commit(series, block, now_ns)
     _finish(series)
 
 
-def _blocks(records: Iterator[MessageRecord]) -> Iterator[list[MessageRecord]]:
+def _split_into_blocks(records: Iterator[MessageRecord]) -> Iterator[list[MessageRecord]]:
     block: list[MessageRecord] = []
     size_bytes = 0
     for record in records:
@@ -160,10 +162,10 @@ def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, p
     if not places:
         return
     channels = dict.fromkeys(place.meta.channel for place in places)
-    topics = tuple(frames_topic(name) for channel in channels for name in frame_topics(channel))
-    series = _series(session, metadata, folder, topics, CompressionType.ZSTD, ZSTD_LEVEL)
+    topics = tuple(make_frames_topic(name) for channel in channels for name in name_frame_topics(channel))
+    series = _open_series(session, metadata, folder, topics, CompressionType.ZSTD, ZSTD_LEVEL)
     for place in places:
-        names, stored, meta = frame_topics(place.meta.channel), read_frame(place), place.meta
+        names, stored, meta = name_frame_topics(place.meta.channel), read_frame(place), place.meta
         stamps = place.sequence, meta.published_ns
         records = [
             MessageRecord(names.meta, meta.time_ns, stored.meta, *stamps),
@@ -173,7 +175,7 @@ def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, p
     _finish(series)
 
 
-def _series(
+def _open_series(
     session: Session,
     metadata: Mapping[str, str],
     folder: Path,
@@ -183,9 +185,9 @@ def _series(
 ) -> Series:
     folder.mkdir(exist_ok=True)
     usual = RecordingSettings()
-    segment_ns = seconds_ns(usual.segment_s)
+    segment_ns = to_ns(usual.segment_s)
     texts, size_bytes = session.attachments, usual.segment_bytes
-    form = SeriesForm(
+    form = SeriesSpec(
         name=folder.name,
         topics=topics,
         compression=compression,

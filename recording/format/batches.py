@@ -44,7 +44,7 @@ class RecordedDevice:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BatchForm:
+class BatchSchema:
     """How the readings of the device `name` are recorded. fields: of each of its channels, in their order; message: the
     class of its messages."""
 
@@ -62,7 +62,7 @@ class BatchForm:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Of its topic: what `form_of` makes the form of again."""
+        """Of its topic: what `parse_batch_schema` makes the form of again."""
         channels = [[each.name, each.unit, each.kind] for each in self.device.channels]
         text = json.dumps(channels, ensure_ascii=False, separators=(",", ":"))
         opened = {} if self.device.is_opened else {_OPENED: _BY_USE}
@@ -84,7 +84,7 @@ class BatchForm:
                 fields[names[0]] = value if value == value else math.nan
                 fields[names[1]] = messages.QUALITY_NUMBER[reading.quality]
             if names is None or reading.reason or reading.cause or reading.time_ns != time_ns or is_repeated:
-                remarks.append(messages.remark_of(reading))
+                remarks.append(messages.encode_remark(reading))
         if remarks:
             fields["remarks"] = remarks
         return self.message(**fields).SerializeToString()
@@ -101,35 +101,37 @@ class BatchForm:
             name = self.message.DESCRIPTOR.full_name
             raise SessionError(f"a message on {self.topic} is not a {name} ({error})") from error
         time_ns: int = message.time_ns or log_time_ns
-        remarks = [messages.remarked(remark) for remark in message.remarks]
+        remarks = [messages.decode_remark(remark) for remark in message.remarks]
         known = {(reading.channel, reading.unit) for reading in remarks}
         readings: list[Reading] = []
         for (channel, unit), (field, of_quality) in self._field_of.items():
             quality: int = getattr(message, of_quality)
             if quality != messages.ABSENT and (channel, unit) not in known:
-                readings.append(messages.reading_of(channel, getattr(message, field), unit, time_ns, quality))
+                readings.append(messages.make_reading(channel, getattr(message, field), unit, time_ns, quality))
         return Batch(self.name, log_time_ns, (*readings, *remarks))
 
 
 @lru_cache(256)
-def batch_form(name: str, device: RecordedDevice) -> BatchForm:
+def make_batch_schema(name: str, device: RecordedDevice) -> BatchSchema:
     """The form for the readings of a device; ValueError when it declares a channel twice."""
     keys = [(f"{name}.{each.name}", each.unit) for each in device.channels]
     if len(set(keys)) < len(keys):
         raise ValueError(f"{name} declares one of its channels twice")
-    fields = fields_of(device.channels)
+    fields = name_fields(device.channels)
     pairs = [(field, f"{field}_quality") for field in fields]
     blank: dict[str, object] = {"device": name, **dict.fromkeys(fields, math.nan)}
-    return BatchForm(name, device, fields, _message_class(name, fields), dict(zip(keys, pairs, strict=True)), blank)
+    return BatchSchema(
+        name, device, fields, _make_message_class(name, fields), dict(zip(keys, pairs, strict=True)), blank
+    )
 
 
-def form_of(metadata: Mapping[str, str]) -> BatchForm:
+def parse_batch_schema(metadata: Mapping[str, str]) -> BatchSchema:
     """The form of a recorded topic, by its metadata; ValueError when they do not say it."""
-    return _form_of(*(metadata.get(key, "") for key in (_DEVICE, _KIND, _CHANNELS, _OPENED)))
+    return _make_schema(*(metadata.get(key, "") for key in (_DEVICE, _KIND, _CHANNELS, _OPENED)))
 
 
 @lru_cache(256)
-def _form_of(name: str, kind: str, text: str, opened: str) -> BatchForm:
+def _make_schema(name: str, kind: str, text: str, opened: str) -> BatchSchema:
     if not _DEVICE_NAME.fullmatch(name):
         raise ValueError(f"{name!r} is not the name of a device")
     channels: object = json.loads(text)
@@ -140,16 +142,16 @@ def _form_of(name: str, kind: str, text: str, opened: str) -> BatchForm:
         if not isinstance(each, list) or [type(part) for part in cast("list[object]", each)] != [str, str, str]:
             raise ValueError(f"{each!r} is not a channel of {name}")
         found.append(Channel(*cast("list[str]", each)))
-    return batch_form(name, RecordedDevice(kind, tuple(found), is_opened=opened != _BY_USE))
+    return make_batch_schema(name, RecordedDevice(kind, tuple(found), is_opened=opened != _BY_USE))
 
 
-def fields_of(channels: Iterable[Channel]) -> tuple[str, ...]:
+def name_fields(channels: Iterable[Channel]) -> tuple[str, ...]:
     """A name for each channel with its unit in it, as schemas and tables can have it: of letters, digits and _, each
     once."""
     taken = {"device", "remarks", "time_ns", "time_utc"}
     fields: list[str] = []
     for each in channels:
-        parts = [re.sub(r"[^A-Za-z0-9]+", "_", part).strip("_") for part in (each.name, unit_word(each.unit))]
+        parts = [re.sub(r"[^A-Za-z0-9]+", "_", part).strip("_") for part in (each.name, format_unit(each.unit))]
         plain = "_".join(part for part in parts if part) or "value"
         plain = plain if plain[0].isalpha() else f"of_{plain}"
         field, number = plain, 2
@@ -166,24 +168,26 @@ def name_apart(channel: str, unit: str, first: str) -> str:
     return channel if unit == first else f"{channel} ({unit})"
 
 
-def unit_word(unit: str) -> str:
+def format_unit(unit: str) -> str:
     """A unit as a part of a name: percent of %, l_per_min of l/min."""
     return _UNIT_WORDS.get(unit, unit.replace("%", "percent").replace("/", " per ").replace("µ", "u"))
 
 
 @lru_cache(256)
-def _message_class(name: str, fields: tuple[str, ...]) -> type[Message]:
+def _make_message_class(name: str, fields: tuple[str, ...]) -> type[Message]:
     """device 1, remarks 2, time_ns 3 (of the readings; 0 when it is the log time), then value and quality of each
     channel. Each class is in a pool of its own: another session may have other channels of a device of that name."""
     own = [
-        messages.field("device", 1, messages.STRING),
-        messages.repeated("remarks", 2, ".thermostand.Reading"),
-        messages.field("time_ns", 3, messages.INSTANT),
+        messages.make_field("device", 1, messages.STRING),
+        messages.make_repeated_field("remarks", 2, ".thermostand.Reading"),
+        messages.make_field("time_ns", 3, messages.INSTANT),
     ]
     for index, each in enumerate(fields):
-        own.append(messages.field(each, 4 + 2 * index, FieldDescriptorProto.TYPE_DOUBLE))
+        own.append(messages.make_field(each, 4 + 2 * index, FieldDescriptorProto.TYPE_DOUBLE))
         own.append(
-            messages.field(f"{each}_quality", 5 + 2 * index, FieldDescriptorProto.TYPE_ENUM, ".thermostand.Quality")
+            messages.make_field(
+                f"{each}_quality", 5 + 2 * index, FieldDescriptorProto.TYPE_ENUM, ".thermostand.Quality"
+            )
         )
     file = FileDescriptorProto(name=f"thermostand/{name}.proto", package="thermostand", syntax="proto3")
     file.dependency.append(messages.READING_FILE.name)

@@ -31,7 +31,7 @@ class FileDamaged(SessionError):
 
 
 @contextmanager
-def reading(path: Path) -> Generator[None]:
+def convert_damage(path: Path) -> Generator[None]:
     """Errors that damage raises inside become a FileDamaged that names the file; one at once for a pipe or a device,
     which might never give a byte."""
     if path.exists() and not path.is_file():
@@ -44,7 +44,7 @@ def reading(path: Path) -> Generator[None]:
 
 
 @contextmanager
-def naming(path: Path) -> Generator[None]:
+def name_file_in_errors(path: Path) -> Generator[None]:
     """A SessionError from inside becomes a FileDamaged, with the file's name in front."""
     try:
         yield

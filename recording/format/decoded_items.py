@@ -12,8 +12,8 @@ from thermostand.foundation.items import Batch, Event, Original, StepMark
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import READINGS
-from thermostand.recording.format.damage import naming
-from thermostand.recording.format.images import decode_image, windows_of
+from thermostand.recording.format.damage import name_file_in_errors
+from thermostand.recording.format.images import decode_image, decode_windows
 from thermostand.recording.format.records import FramePlace, RecordedMessage, read_frame
 
 
@@ -34,45 +34,45 @@ class RecordedImage:
         return self.meta.time_ns
 
 
-def recorded_image(place: FramePlace) -> RecordedImage:
+def read_recorded_image(place: FramePlace) -> RecordedImage:
     """The frame at that place; SessionError when it is damaged."""
     description, image = read_frame(place)
     return RecordedImage(place.meta, description, image, place.path, place.chunk.length)
 
 
-def step_of(message: RecordedMessage) -> StepMark:
+def decode_step_item(message: RecordedMessage) -> StepMark:
     """The step mark in a message; SessionError when it is none."""
     return messages.decode_step(message.data, message.time_ns)
 
 
-def event_of(message: RecordedMessage) -> Event:
+def decode_event_item(message: RecordedMessage) -> Event:
     """The event in a message; SessionError when it is none."""
     return messages.decode_event(message.data, message.time_ns)
 
 
-def stands_for_item(channel: Channel) -> bool:
+def is_item_channel(channel: Channel) -> bool:
     """Whether each message of a channel is an item; not so the log and the table's pose, which the recorder derives."""
     return channel.topic.startswith(READINGS) or channel.topic in (messages.STEP, messages.EVENT, messages.ORIGINAL)
 
 
-def item_of(message: RecordedMessage) -> Batch | StepMark | Event | Original:
+def decode_item(message: RecordedMessage) -> Batch | StepMark | Event | Original:
     """The item that a message stands for."""
     if message.form is not None:
         return message.form.decode(message.data, message.time_ns)
     match message.topic:
         case messages.STEP:
-            return step_of(message)
+            return decode_step_item(message)
         case messages.EVENT:
-            return event_of(message)
+            return decode_event_item(message)
         case _:
             return messages.decode_original(message.data, message.time_ns)
 
 
-def frame_of(recorded: RecordedImage) -> Frame:
+def decode_frame(recorded: RecordedImage) -> Frame:
     """The frame of a recorded image. SessionError when it is damaged."""
     meta = recorded.meta
-    with naming(recorded.path):
-        image, windows = decode_image(recorded.data), windows_of(meta)
+    with name_file_in_errors(recorded.path):
+        image, windows = decode_image(recorded.data), decode_windows(meta)
         if image.shape != (meta.height, meta.width):
             raise SessionError(f"an image of {image.shape} px is described as one of {(meta.height, meta.width)}")
     return Frame(

@@ -36,7 +36,7 @@ class Hole:
         """Whether something of that instant would have been in it."""
         return (self.begin_ns is None or self.begin_ns < time_ns) and (self.end_ns is None or time_ns < self.end_ns)
 
-    def within(self, begin_ns: int, end_ns: int) -> Hole | None:
+    def clip(self, begin_ns: int, end_ns: int) -> Hole | None:
         """What of it lies in [begin_ns, end_ns), None when nothing does; how many frames that are is known of all."""
         first_ns = begin_ns - 1 if self.begin_ns is None else max(self.begin_ns, begin_ns - 1)
         last_ns = end_ns if self.end_ns is None else min(self.end_ns, end_ns)
@@ -45,7 +45,7 @@ class Hole:
         is_whole = (first_ns, last_ns) == (self.begin_ns, self.end_ns)
         return replace(self, begin_ns=first_ns, end_ns=last_ns, frames=self.frames if is_whole else 0)
 
-    def when(self, utc: UtcOffsets) -> str:
+    def format_time(self, utc: UtcOffsets) -> str:
         """`from 2026-01-01 18:00:00 to 2026-01-01 18:10:00 CET`, "" when nothing is known of it."""
         if self.end_ns is None:
             return "" if self.begin_ns is None else f"from {utc.local_text(self.begin_ns)}"
@@ -56,12 +56,12 @@ class Hole:
         """Which segments, when, and how many frames, as a part of a sentence."""
         frames = "" if not self.frames else f"{self.frames} frame{'' if self.frames == 1 else 's'} {_WHAT[self.series]}"
         if self.first is None:
-            return ", ".join(part for part in (frames, self.when(utc)) if part)
-        behind = ", ".join(part for part in (self.when(utc), frames) if part)
-        return f"{segments_text(self.series, self.first, self.last)}{f' ({behind})' if behind else ''}"
+            return ", ".join(part for part in (frames, self.format_time(utc)) if part)
+        behind = ", ".join(part for part in (self.format_time(utc), frames) if part)
+        return f"{format_segments(self.series, self.first, self.last)}{f' ({behind})' if behind else ''}"
 
 
-def segments_text(series: str, first: int, last: int | None) -> str:
+def format_segments(series: str, first: int, last: int | None) -> str:
     """`telemetry/0003.mcap to 0012.mcap`."""
     name = f"{series}/{first:04d}.mcap"
     if last is None:
@@ -69,23 +69,23 @@ def segments_text(series: str, first: int, last: int | None) -> str:
     return name if last == first else f"{name} to {last:04d}.mcap"
 
 
-def holes_text(holes: Iterable[Hole]) -> str:
+def format_holes(holes: Iterable[Hole]) -> str:
     """For the session record of a copy; "" when there is none."""
     entries = [asdict(hole) for hole in holes]
     return json.dumps(entries, separators=(",", ":")) if entries else ""
 
 
-def holes_in(text: str) -> tuple[Hole, ...]:
+def parse_holes(text: str) -> tuple[Hole, ...]:
     """The inverse; what is not understood of a text is left out."""
     try:
         found: object = json.loads(text) if text else []
     except (ValueError, RecursionError):
         return ()
     entries = cast("list[object]", found) if isinstance(found, list) else []
-    return tuple(hole for entry in entries if (hole := _hole(entry)) is not None)
+    return tuple(hole for entry in entries if (hole := _parse_hole(entry)) is not None)
 
 
-def _hole(entry: object) -> Hole | None:
+def _parse_hole(entry: object) -> Hole | None:
     if not isinstance(entry, dict):
         return None
     fields = cast("dict[str, object]", entry)

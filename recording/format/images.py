@@ -18,16 +18,16 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.image_limit import size_fault
+from thermostand.foundation.image_limit import describe_size_fault
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.messages import (
     FRAME_META_CLASS,
     FrameMeta,
     encode_frame_meta,
-    timestamp,
-    varint,
+    encode_varint,
+    make_timestamp,
 )
 
 ImageArray = NDArray[np.uint8] | NDArray[np.uint16]
@@ -57,14 +57,14 @@ class FrameTopics(NamedTuple):
     image: str
 
 
-def frame_topics(channel: str) -> FrameTopics:
+def name_frame_topics(channel: str) -> FrameTopics:
     """The topics of the frames of a channel, `camera.image`."""
     place = "/" + channel.removesuffix(".image").replace(".", "/")
     return FrameTopics(f"{place}/meta", f"{place}/image")
 
 
 @dataclass(frozen=True, slots=True)
-class Circumstances:
+class FrameContext:
     """What is known of a frame beside itself: when it was published, what for and at which set-point (NaN: unknown),
     and the last reading of each temperature and position."""
 
@@ -74,9 +74,9 @@ class Circumstances:
     readings: tuple[Reading, ...] = ()
 
 
-def encode_meta(frame: Frame, known: Circumstances) -> bytes:
+def encode_meta(frame: Frame, known: FrameContext) -> bytes:
     """The frame's description. ValueError when its windows are not within the image."""
-    image = _grey(frame.image)
+    image = _check_grey(frame.image)
     if frame.windows is not None:
         _check_windows(frame.windows, image.shape)
     height, width = image.shape
@@ -108,20 +108,20 @@ def encode_image(frame: Frame) -> bytes:
 
     ValueError when the image is not uint8 or uint16 of shape (height, width).
     """
-    image = _grey(frame.image)
+    image = _check_grey(frame.image)
     name = {1: "mono8", 2: "mono16"}[image.itemsize]
     pixels = np.ascontiguousarray(image, _DTYPE[name])
     height, width = image.shape
     before = RawImage(
-        timestamp=timestamp(frame.time_ns), width=width, height=height, encoding=name, step=width * image.itemsize
+        timestamp=make_timestamp(frame.time_ns), width=width, height=height, encoding=name, step=width * image.itemsize
     )
     behind = RawImage(frame_id=frame.channel)
     return b"".join(
-        (before.SerializeToString(), _DATA_TAG, varint(pixels.nbytes), pixels.data, behind.SerializeToString())
+        (before.SerializeToString(), _DATA_TAG, encode_varint(pixels.nbytes), pixels.data, behind.SerializeToString())
     )
 
 
-def _grey(image: ImageArray) -> ImageArray:
+def _check_grey(image: ImageArray) -> ImageArray:
     if image.ndim != 2 or image.size == 0 or image.dtype.name not in ("uint8", "uint16"):
         raise ValueError(f"an image is uint8 or uint16 of shape (height, width), not {image.dtype} {image.shape}")
     return image
@@ -131,14 +131,14 @@ def decode_image(data: bytes | memoryview) -> ImageArray:
     """The pixels (height, width) of a foxglove.RawImage, which stay in `data` where the machine has the same byte
     order; SessionError when it is none of ours."""
     try:
-        pixels, others = _without_pixels(memoryview(data))
+        pixels, others = _split_pixels(memoryview(data))
         raw = RawImage.FromString(others)
     except (ValueError, IndexError, DecodeError) as error:
         raise SessionError(f"an image message cannot be read ({error})") from error
     dtype = _DTYPE.get(raw.encoding)
     if dtype is None:
         raise SessionError(f"a recorded image has the encoding {raw.encoding[:40]!r}; mono8 and mono16 are known")
-    if fault := size_fault(raw.width, raw.height):
+    if fault := describe_size_fault(raw.width, raw.height):
         raise SessionError(f"a recorded image {fault}")
     row_bytes = raw.width * dtype.itemsize
     if raw.step != row_bytes or len(pixels) != row_bytes * raw.height:
@@ -147,18 +147,18 @@ def decode_image(data: bytes | memoryview) -> ImageArray:
     return cast(ImageArray, image.astype(dtype.newbyteorder("="), copy=False))
 
 
-def _without_pixels(message: memoryview) -> tuple[memoryview, bytes]:
+def _split_pixels(message: memoryview) -> tuple[memoryview, bytes]:
     """The pixels of an image message, not copied, and all its other fields; ValueError or IndexError when it is cut."""
     pixels, others, at, size = message[:0], bytearray(), 0, 0
     while at < len(message):
         begin = at
-        tag, at = _varint_at(message, at)
+        tag, at = _read_varint(message, at)
         match tag & 7:
             case 2:
-                size, at = _varint_at(message, at)
+                size, at = _read_varint(message, at)
                 at += size
             case 0:
-                _, at = _varint_at(message, at)
+                _, at = _read_varint(message, at)
             case 1:
                 at += 8
             case 5:
@@ -174,7 +174,7 @@ def _without_pixels(message: memoryview) -> tuple[memoryview, bytes]:
     return pixels, bytes(others)
 
 
-def _varint_at(message: memoryview, at: int) -> tuple[int, int]:
+def _read_varint(message: memoryview, at: int) -> tuple[int, int]:
     """The number there, and where it ends."""
     number = 0
     for shift in range(0, 70, 7):
@@ -186,7 +186,7 @@ def _varint_at(message: memoryview, at: int) -> tuple[int, int]:
     raise ValueError("a number is too long")
 
 
-def windows_of(meta: FrameMeta) -> Windows | None:
+def decode_windows(meta: FrameMeta) -> Windows | None:
     """The windows (n, 4) of a frame, None when all of it is there; SessionError when they cannot be right."""
     if not meta.windows:
         return None
@@ -212,14 +212,14 @@ def encode_png(image: ImageArray) -> bytes:
     """The image (height, width) as a PNG, for other programs. ValueError when it is not uint8 or uint16."""
     import cv2  # a program that writes none need not wait for OpenCV
 
-    done, png = cv2.imencode(".png", _grey(image))
+    done, png = cv2.imencode(".png", _check_grey(image))
     if not done:
         raise SessionError(f"OpenCV could not make a PNG of an image of {image.shape[1]} x {image.shape[0]} px")
     return png.tobytes()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Whole:
+class _WholeFrame:
     """Result of the last whole frame that was searched; windows: None when none were found. fill_DN: its median, so
     that the edges of the windows do not look like edges of markers."""
 
@@ -243,8 +243,8 @@ class MarkerWindows:
     def __init__(self, find_windows: Callable[[ImageArray], Windows | None], whole_every_s: float = 60.0) -> None:
         self.tell: Callable[[str], None] = lambda text: None  # of a search that failed; set by the recording
         self._find_windows = find_windows
-        self._whole_every_ns = seconds_ns(whole_every_s)
-        self._wholes: dict[str, _Whole] = {}  # channel -> its last whole frame
+        self._whole_every_ns = to_ns(whole_every_s)
+        self._wholes: dict[str, _WholeFrame] = {}  # channel -> its last whole frame
 
     def __call__(self, frame: Frame) -> Frame:
         """The frame as it is to be recorded; one that is partial already stays as it is."""
@@ -253,11 +253,11 @@ class MarkerWindows:
         whole, kind = self._wholes.get(frame.channel), (frame.step_id, frame.image.shape, frame.image.dtype)
         if whole is None or whole.kind != kind or not 0 <= frame.time_ns - whole.time_ns < self._whole_every_ns:
             fill_DN = int(np.median(frame.image[::FILL_STEP_px, ::FILL_STEP_px]))
-            self._wholes[frame.channel] = _Whole(frame.time_ns, kind, self._windows_in(frame.image), fill_DN)
+            self._wholes[frame.channel] = _WholeFrame(frame.time_ns, kind, self._search_windows(frame.image), fill_DN)
             return frame
         return frame if whole.windows is None else _partial(frame, whole.windows, whole.fill_DN)
 
-    def _windows_in(self, image: ImageArray) -> Windows | None:
+    def _search_windows(self, image: ImageArray) -> Windows | None:
         try:
             return self._find_windows(image)
         except Exception as error:  # noqa: BLE001 - the frames stay whole, and that is never wrong
@@ -273,6 +273,6 @@ def _partial(frame: Frame, windows: Windows, fill_DN: int) -> Frame:
     return replace(frame, image=image, windows=windows)
 
 
-def last_readings(readings: Iterable[Reading]) -> tuple[Reading, ...]:
+def select_frame_readings(readings: Iterable[Reading]) -> tuple[Reading, ...]:
     """Those that describe a frame: temperatures and positions."""
     return tuple(reading for reading in readings if reading.unit in ("degC", "mm", "deg"))

@@ -23,7 +23,7 @@ from thermostand.recording.format.layout import (
     SESSION_CRC,
     TELEMETRY,
     UNFINISHED,
-    segment_metadata,
+    make_segment_metadata,
 )
 
 MOST_MISSING = 10_000  # segments; a night has hundreds
@@ -62,33 +62,33 @@ class SegmentFile:
         return f"{self.series}/{self.path.name}"
 
 
-def inventory(directory: Path) -> tuple[SegmentFile, ...]:
+def list_segments(directory: Path) -> tuple[SegmentFile, ...]:
     """The segments in `directory`, telemetry first, in order of their numbers; none when it is no session."""
-    return tuple(file for series in (TELEMETRY, FRAMES) for file in _of_series(directory / series))
+    return tuple(file for series in (TELEMETRY, FRAMES) for file in _list_series(directory / series))
 
 
-def strays(directory: Path) -> tuple[str, ...]:
+def list_strays(directory: Path) -> tuple[str, ...]:
     """What lies among the segments, is called as if it were one, and is none: a copy (`0003 (1).mcap`, `00003.mcap`),
     what another system leaves (`._0003.mcap`), or no file. It counts for nothing."""
     found: list[str] = []
     for series in (TELEMETRY, FRAMES):
         with suppress(OSError):
             names = [path.name for path in (directory / series).iterdir() if path.name.endswith(tuple(_STATE))]
-            known = {file.path.name for file in _of_series(directory / series)}
+            known = {file.path.name for file in _list_series(directory / series)}
             found += [f"{series}/{name}" for name in sorted(set(names) - known)]
     return tuple(found)
 
 
-def _of_series(folder: Path) -> list[SegmentFile]:
+def _list_series(folder: Path) -> list[SegmentFile]:
     try:
         paths = list(folder.iterdir())
     except OSError:  # no such folder
         return []
-    files = [file for path in paths if (file := _segment_file(path)) is not None]
+    files = [file for path in paths if (file := _parse_segment_file(path)) is not None]
     return sorted(files, key=lambda file: (file.number, file.path.name))
 
 
-def _segment_file(path: Path) -> SegmentFile | None:
+def _parse_segment_file(path: Path) -> SegmentFile | None:
     """The segment at `path`; None when it is none, or was given another name under our eyes."""
     name = _NAME.fullmatch(path.name)
     try:
@@ -117,14 +117,14 @@ def is_locked(path: Path) -> bool:
     return False
 
 
-def misplaced(series: str, number: int, place: Mapping[str, str], session: Mapping[str, str]) -> bool:
+def is_misplaced(series: str, number: int, place: Mapping[str, str], session: Mapping[str, str]) -> bool:
     """Whether the record `segment` gives another place in the session than the file's name: it was doubled, swapped or
     renamed."""
-    due = segment_metadata(series, number, session)
+    due = make_segment_metadata(series, number, session)
     return bool(place.keys() - due.keys()) or any(place.get(key) != due[key] for key in due.keys() - {SESSION_CRC})
 
 
-def foreign_numbers(numbers: Iterable[int]) -> set[int]:
+def find_foreign_numbers(numbers: Iterable[int]) -> set[int]:
     """Those that no segment of the session can have: behind more missing ones than any session has segments."""
     known = sorted(set(numbers))
     for place, (before, after) in enumerate(pairwise([-1, *known])):
@@ -133,9 +133,9 @@ def foreign_numbers(numbers: Iterable[int]) -> set[int]:
     return set()
 
 
-def missing_numbers(numbers: Iterable[int]) -> Iterator[tuple[int, int]]:
+def find_missing_numbers(numbers: Iterable[int]) -> Iterator[tuple[int, int]]:
     """(first, last) of each range of numbers from 0 on that is not there; foreign ones do not count."""
     known = set(numbers)
-    for before, after in pairwise([-1, *sorted(known - foreign_numbers(known))]):
+    for before, after in pairwise([-1, *sorted(known - find_foreign_numbers(known))]):
         if after > before + 1:
             yield before + 1, after - 1

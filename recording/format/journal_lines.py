@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from thermostand.foundation.json_values import json_object
+from thermostand.foundation.json_values import parse_json_object
 
 JOURNAL_NAME = "journal.jsonl"
 LIMIT_BYTES = 32_000_000  # an entry a minute for 200 days; all of them are in memory
@@ -35,28 +35,28 @@ class CheckedLines:
     unended_bytes: int
 
 
-def mark_of(name: str) -> bytes:
+def make_mark(name: str) -> bytes:
     """Of a new file in the session of that name; copies and renamed sessions keep what they have."""
     return b"%08x" % zlib.crc32(name.encode(errors="surrogateescape"))
 
 
-def journal_lines(texts: Iterable[bytes], mark: bytes, place: int = 0) -> bytes:
+def format_lines(texts: Iterable[bytes], mark: bytes, place: int = 0) -> bytes:
     """JSON texts as lines, of which the first begins at that place of the file."""
     found = bytearray()
     for text in texts:
         marked = b"%s %s" % (mark, text)
-        found += b"%s%s\n" % (_crc(marked, place + len(found)), marked)
+        found += b"%s%s\n" % (_format_crc(marked, place + len(found)), marked)
     return bytes(found)
 
 
-def lines_of(data: bytes) -> CheckedLines:
+def parse_lines(data: bytes) -> CheckedLines:
     """What is sound of a journal, and what is not."""
     *lines, unended = data.split(b"\n")  # what has no end of line is no line
     found = [b""] * len(lines)  # of each line, mark and JSON where it fits its CRC
     ends: list[int] = []
     place = 0
     for number, line in enumerate(lines):
-        if line[:9] == _crc(line[9:], place):
+        if line[:9] == _format_crc(line[9:], place):
             found[number] = line[9:]
         place += len(line) + 1
         ends.append(place)
@@ -68,19 +68,19 @@ def lines_of(data: bytes) -> CheckedLines:
     return CheckedLines(tuple(filter(None, texts)), damaged, len(lines), size_bytes, mark, len(unended))
 
 
-def _crc(marked: bytes, place: int) -> bytes:
+def _format_crc(marked: bytes, place: int) -> bytes:
     """With the space behind it."""
     return b"%08x " % zlib.crc32(marked, place)
 
 
-def damage_text(lines: CheckedLines) -> str:
+def format_damage(lines: CheckedLines) -> str:
     """Which lines are damaged, as the part of a sentence."""
     first = f"line {lines.damaged[0]}"
     more = f" and {len(lines.damaged) - 1} more" if len(lines.damaged) > 1 else ""
     return f"{first}{more} of {lines.of} {'are' if more else 'is'} damaged; the lines after it count"
 
 
-def unended_text(unended_bytes: int) -> str:
+def format_unended(unended_bytes: int) -> str:
     """What is behind the last end of a line, as the part of a sentence."""
     return f"the last {unended_bytes} bytes are no line: one was being written, or is lost"
 
@@ -91,7 +91,7 @@ class JournalFacts:
 
     last_ns: instant of its last entry. status, ended_ns: how and when the run ended, "" and 0 when the last entry does
     not say. done: ids of the steps that are done, which were on the disk then. damage: what is wrong with the file, ""
-    when nothing is. unended: what is no line at its end, "" when nothing is. texts: name -> hash (`text_hash`) of each
+    when nothing is. unended: what is no line at its end, "" when nothing is. texts: name -> hash (`hash_text`) of each
     text the run began with, None when the journal does not say.
     """
 
@@ -105,12 +105,12 @@ class JournalFacts:
     texts: Mapping[str, str] | None = None
 
 
-def text_hash(text: str | None) -> str:
+def hash_text(text: str | None) -> str:
     """Of an attached text; "" for none."""
     return "" if text is None else hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
-def journal_facts(directory: Path) -> JournalFacts | None:
+def read_journal_facts(directory: Path) -> JournalFacts | None:
     """Of the journal in a session's folder, which is not changed; None when there is none."""
     path = directory / JOURNAL_NAME
     try:
@@ -118,30 +118,32 @@ def journal_facts(directory: Path) -> JournalFacts | None:
             return None
         if path.stat().st_size > LIMIT_BYTES:
             return JournalFacts(damage=f"is larger than {LIMIT_BYTES // 1_000_000} MB and was not read")
-        lines = lines_of(path.read_bytes())
+        lines = parse_lines(path.read_bytes())
     except OSError as error:
         return JournalFacts(damage=f"cannot be read ({error.strerror})")
     last = next(
-        (entry for text in reversed(lines.sound) if (entry := json_object(text)) is not None), dict[str, object]()
+        (entry for text in reversed(lines.sound) if (entry := parse_json_object(text)) is not None), dict[str, object]()
     )
     few = (text for text in lines.sound if b'"done"' in text or b'"Gap"' in text)  # the others take seconds to decode
-    entries = [entry for text in few if (entry := json_object(text)) is not None]
+    entries = [entry for text in few if (entry := parse_json_object(text)) is not None]
     is_end = last.get("entry") == "Ended"
     done = (entry.get("step_id") for entry in entries if entry.get("entry") == "Step" and entry.get("state") == "done")
-    last_ns = _instant(last.get("time_ns"))
+    last_ns = _check_instant(last.get("time_ns"))
     return JournalFacts(
         last_ns=last_ns,
         status=str(last.get("status")) if is_end else "",
         ended_ns=last_ns if is_end else 0,
-        resumed_ns=max((_instant(entry.get("time_ns")) for entry in entries if entry.get("entry") == "Gap"), default=0),
+        resumed_ns=max(
+            (_check_instant(entry.get("time_ns")) for entry in entries if entry.get("entry") == "Gap"), default=0
+        ),
         done=frozenset(step_id for step_id in done if isinstance(step_id, str)),
-        damage=damage_text(lines) if lines.damaged else "",
-        unended=unended_text(lines.unended_bytes) if lines.unended_bytes else "",
-        texts=_texts(json_object(lines.sound[0]) if lines.sound else None),
+        damage=format_damage(lines) if lines.damaged else "",
+        unended=format_unended(lines.unended_bytes) if lines.unended_bytes else "",
+        texts=_read_texts(parse_json_object(lines.sound[0]) if lines.sound else None),
     )
 
 
-def _texts(first: Mapping[str, object] | None) -> dict[str, str] | None:
+def _read_texts(first: Mapping[str, object] | None) -> dict[str, str] | None:
     """Those of a journal's first entry."""
     found = None if first is None or first.get("entry") != "Begun" else first.get("texts")
     if not isinstance(found, dict):
@@ -149,6 +151,6 @@ def _texts(first: Mapping[str, object] | None) -> dict[str, str] | None:
     return {str(name): str(known) for name, known in cast("dict[object, object]", found).items()}
 
 
-def _instant(value: object) -> int:
+def _check_instant(value: object) -> int:
     """ns since the epoch; 0 for what is no instant."""
     return value if isinstance(value, int) and 0 <= value < 1 << 63 else 0

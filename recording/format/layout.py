@@ -23,7 +23,7 @@ FORMAT = 3
 _FORMAT_DIGITS = 4  # a longer number is no format
 
 
-def unknown_format(session: Mapping[str, str]) -> str:
+def explain_unknown_format(session: Mapping[str, str]) -> str:
     """What is wrong with the format that the record `session` states, in words; "" for one that this version knows, and
     for a record that is not there."""
     text = session.get("format", "")
@@ -36,17 +36,17 @@ def unknown_format(session: Mapping[str, str]) -> str:
     return f"is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}"
 
 
-def segment_metadata(series: str, number: int, session: Mapping[str, str]) -> dict[str, str]:
+def make_segment_metadata(series: str, number: int, session: Mapping[str, str]) -> dict[str, str]:
     """The record `segment`: its place in the session, and a CRC of `session`, for MCAP gives metadata none."""
     previous = f"{number - 1:04d}" if number else ""
-    return {"series": series, "number": f"{number:04d}", "previous": previous, SESSION_CRC: _crc_text(session)}
+    return {"series": series, "number": f"{number:04d}", "previous": previous, SESSION_CRC: _format_crc(session)}
 
 
-def contradicts(segment: Mapping[str, str], session: Mapping[str, str]) -> bool:
+def is_contradicting(segment: Mapping[str, str], session: Mapping[str, str]) -> bool:
     """Whether the two records of one segment do not belong together: one of them is damaged."""
-    return segment.get(SESSION_CRC, _crc_text(session)) != _crc_text(session)
+    return segment.get(SESSION_CRC, _format_crc(session)) != _format_crc(session)
 
 
-def _crc_text(session: Mapping[str, str]) -> str:
+def _format_crc(session: Mapping[str, str]) -> str:
     text = "".join(f"{key}\0{value}\0" for key, value in sorted(session.items()))
     return f"{zlib.crc32(text.encode()):08x}"

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self, cast
 
-from thermostand.foundation.json_values import json_object
-from thermostand.recording.format.layout import FORMAT, unknown_format
+from thermostand.foundation.json_values import parse_json_object
+from thermostand.recording.format.layout import FORMAT, explain_unknown_format
 
 MANIFEST_NAME = "session.json"
 _LIMIT_BYTES = 64_000_000  # hundreds of thousands of segments
@@ -75,7 +75,7 @@ class Sealed:
 
 
 @dataclass(frozen=True, slots=True)
-class JournalSoFar:
+class JournalDigest:
     """The first lines of a journal: how many, their bytes, and the SHA-256 of these."""
 
     lines: int
@@ -83,10 +83,10 @@ class JournalSoFar:
     sha256: str
 
 
-def journal_so_far(data: bytes) -> JournalSoFar:
+def digest_journal(data: bytes) -> JournalDigest:
     """Of all whole lines in `data`."""
     whole = data[: data.rfind(b"\n") + 1]
-    return JournalSoFar(whole.count(b"\n"), len(whole), hashlib.sha256(whole).hexdigest())
+    return JournalDigest(whole.count(b"\n"), len(whole), hashlib.sha256(whole).hexdigest())
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,16 +102,16 @@ class Manifest:
     texts: Mapping[str, str] = field(default_factory=dict[str, str])
     plan: Mapping[str, int] = field(default_factory=dict[str, int])
     segments: Mapping[str, Sealed] = field(default_factory=dict[str, Sealed])
-    journal: JournalSoFar | None = None
+    journal: JournalDigest | None = None
     ended: bool = False
     remade: bool = False
 
-    def encoded(self) -> bytes:
+    def encode(self) -> bytes:
         """The file; the same of the same contents."""
         fields = {"format": FORMAT, **asdict(self)}
-        return json.dumps({**fields, "sha256": _sha256_of(fields)}, indent=1, sort_keys=True).encode() + b"\n"
+        return json.dumps({**fields, "sha256": _compute_sha256(fields)}, indent=1, sort_keys=True).encode() + b"\n"
 
-    def with_segment(self, name: str, sealed: Sealed) -> Manifest:
+    def add_segment(self, name: str, sealed: Sealed) -> Manifest:
         """With that one more, or as it is now."""
         return replace(self, segments={**self.segments, name: sealed})
 
@@ -126,7 +126,7 @@ class NoManifest:
     is_newer: bool = False
 
 
-def _sha256_of(fields: Mapping[str, object]) -> str:
+def _compute_sha256(fields: Mapping[str, object]) -> str:
     return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
@@ -138,35 +138,35 @@ def read_manifest(directory: Path) -> Manifest | NoManifest:
             return NoManifest("is missing", is_missing=True)
         if not path.is_file() or path.stat().st_size > _LIMIT_BYTES:
             return NoManifest("is no file, or far too large")
-        return _decoded(path.read_bytes())
+        return _decode(path.read_bytes())
     except OSError as error:
         return NoManifest(f"cannot be read ({error.strerror})")
 
 
-def _decoded(data: bytes) -> Manifest | NoManifest:
-    fields = json_object(data)
+def _decode(data: bytes) -> Manifest | NoManifest:
+    fields = parse_json_object(data)
     if fields is None:
         return NoManifest("is damaged: it is no JSON object")
     number = fields.get("format")
-    if fault := unknown_format({"format": str(number)}):
+    if fault := explain_unknown_format({"format": str(number)}):
         return NoManifest(fault, is_newer=isinstance(number, int))
     stated = fields.pop("sha256", None)
     try:
-        is_as_written = stated == _sha256_of(fields)
+        is_as_written = stated == _compute_sha256(fields)
     except RecursionError:  # nested too deep to be written
         is_as_written = False
     if not is_as_written:
         return NoManifest("was edited or is damaged: it does not fit its own checksum")
     try:
-        return _manifest(cast("dict[str, Any]", fields))
+        return _build_manifest(cast("dict[str, Any]", fields))
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         return NoManifest(f"does not say what every one says ({type(error).__name__}: {error})")
 
 
-def _manifest(stated: Mapping[str, Any]) -> Manifest:
+def _build_manifest(stated: Mapping[str, Any]) -> Manifest:
     """The fields as their types; LookupError, TypeError, ValueError or AttributeError when they are others."""
     segments = {str(name): Sealed(**each) for name, each in stated["segments"].items()}
-    journal = None if stated["journal"] is None else JournalSoFar(**stated["journal"])
+    journal = None if stated["journal"] is None else JournalDigest(**stated["journal"])
     devices = {str(name): dict(each) for name, each in stated["devices"].items()}
     texts = [*stated["session"].values(), *stated["texts"].values(), *(each.sha256 for each in segments.values())]
     counts = [*stated["plan"].values(), *(count for each in segments.values() for count in each.messages.values())]

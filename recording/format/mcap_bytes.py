@@ -70,7 +70,7 @@ class ChunkHead(NamedTuple):
     begin: int
 
 
-def records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+def iterate_records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
     """(opcode, content) of each record; struct.error when the last one is cut."""
     offset = 0
     while offset < len(data):
@@ -82,12 +82,12 @@ def records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         offset += length
 
 
-def stream(data: bytes | memoryview) -> ReadDataStream:
+def make_stream(data: bytes | memoryview) -> ReadDataStream:
     """The content of a record, for the mcap package's record readers."""
     return ReadDataStream(io.BytesIO(data))
 
 
-def bytes_of(record: McapRecord) -> bytes:
+def encode_record(record: McapRecord) -> bytes:
     """The record as the writer writes it."""
     builder = RecordBuilder()
     record.write(builder)
@@ -106,7 +106,7 @@ def check_attachment(content: bytes) -> None:
     check_crc(content[: -CRC.size], crc, "an attachment")
 
 
-def chunk_head(content: bytes | memoryview, length: int) -> ChunkHead:
+def parse_chunk_head(content: bytes | memoryview, length: int) -> ChunkHead:
     """The head of a chunk, from the begin of its record's content, which has that length; ValueError when its sizes
     are not those of a chunk of ours, struct.error when it is cut."""
     first_ns, last_ns, size_bytes, crc, name_bytes = CHUNK.unpack_from(content)
@@ -122,27 +122,27 @@ def chunk_head(content: bytes | memoryview, length: int) -> ChunkHead:
     return ChunkHead(first_ns, last_ns, size_bytes, crc, name, begin)
 
 
-def chunk_content(content: memoryview) -> tuple[ChunkHead, memoryview]:
+def decompress_chunk(content: memoryview) -> tuple[ChunkHead, memoryview]:
     """Head and records of a chunk, from the whole content of its record, the CRC checked; ValueError, struct.error or
     ZstdError when it is damaged."""
-    head = chunk_head(content, len(content))
+    head = parse_chunk_head(content, len(content))
     data = content[head.begin :]
     if head.compression:
-        data = _inflated(data, head.size_bytes)
+        data = _decompress(data, head.size_bytes)
     check_crc(data, head.crc, "a chunk")
     return head, data
 
 
-def _inflated(data: memoryview, size_bytes: int) -> memoryview:
+def _decompress(data: memoryview, size_bytes: int) -> memoryview:
     """What zstd has made of so many bytes, in memory that may be written to; ValueError when it is another number."""
     # As much memory is taken as the chunk says: so both have to say the same.
     if zstandard.frame_content_size(data) != size_bytes:
         raise ValueError("a chunk's size is wrong")
-    room = np.empty(size_bytes, np.uint8).data  # not cleared first, as a bytearray would be
+    buffer = np.empty(size_bytes, np.uint8).data  # not cleared first, as a bytearray would be
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
         done = 0
-        while done < size_bytes and (read := stream.readinto(room[done:])):
+        while done < size_bytes and (read := stream.readinto(buffer[done:])):
             done += read
     if done != size_bytes:
         raise ValueError("a chunk's size is wrong")
-    return room
+    return buffer

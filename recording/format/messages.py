@@ -56,7 +56,7 @@ ABSENT = 0
 _pool = descriptor_pool.Default()
 
 
-def field(
+def make_field(
     name: str, number: int, kind: FieldDescriptorProto.Type.ValueType, type_name: str = ""
 ) -> FieldDescriptorProto:
     """One singular field; `type_name` for an enum or a message."""
@@ -64,14 +64,14 @@ def field(
     return FieldDescriptorProto(name=name, number=number, type=kind, label=label, type_name=type_name or None)
 
 
-def repeated(name: str, number: int, type_name: str) -> FieldDescriptorProto:
+def make_repeated_field(name: str, number: int, type_name: str) -> FieldDescriptorProto:
     """Any number of messages."""
-    found = field(name, number, MESSAGE, type_name)
+    found = make_field(name, number, MESSAGE, type_name)
     found.label = FieldDescriptorProto.LABEL_REPEATED
     return found
 
 
-def _class_of(name: str, fields: list[FieldDescriptorProto], *needs: str) -> type[Message]:
+def _make_class(name: str, fields: list[FieldDescriptorProto], *needs: str) -> type[Message]:
     """The class of `thermostand.<name>` with these fields, of messages of our own files that it needs."""
     file = FileDescriptorProto(name=f"thermostand/{name}.proto", package="thermostand", syntax="proto3")
     file.message_type.add(name=name, field=fields)
@@ -80,22 +80,22 @@ def _class_of(name: str, fields: list[FieldDescriptorProto], *needs: str) -> typ
     return GetMessageClass(_pool.FindMessageTypeByName(f"thermostand.{name}"))
 
 
-def _plain_class(name: str, fields: Mapping[str, FieldDescriptorProto.Type.ValueType]) -> type[Message]:
+def _make_plain_class(name: str, fields: Mapping[str, FieldDescriptorProto.Type.ValueType]) -> type[Message]:
     """A message of scalar fields, numbered from 1 in order."""
-    return _class_of(name, [field(each, number, kind) for number, (each, kind) in enumerate(fields.items(), 1)])
+    return _make_class(name, [make_field(each, number, kind) for number, (each, kind) in enumerate(fields.items(), 1)])
 
 
-def _reading_file() -> FileDescriptorProto:
+def _make_reading_file() -> FileDescriptorProto:
     """A reading in full, and its quality."""
     file = FileDescriptorProto(name="thermostand/Reading.proto", package="thermostand", syntax="proto3")
     fields = [
-        field("channel", 1, STRING),
-        field("value", 2, FieldDescriptorProto.TYPE_DOUBLE),
-        field("unit", 3, STRING),
-        field("time_ns", 4, INSTANT),
-        field("quality", 5, FieldDescriptorProto.TYPE_ENUM, ".thermostand.Quality"),
-        field("reason", 6, STRING),
-        field("cause", 7, STRING),
+        make_field("channel", 1, STRING),
+        make_field("value", 2, FieldDescriptorProto.TYPE_DOUBLE),
+        make_field("unit", 3, STRING),
+        make_field("time_ns", 4, INSTANT),
+        make_field("quality", 5, FieldDescriptorProto.TYPE_ENUM, ".thermostand.Quality"),
+        make_field("reason", 6, STRING),
+        make_field("cause", 7, STRING),
     ]
     file.message_type.add(name="Reading", field=fields)
     quality = file.enum_type.add(name="Quality")
@@ -104,7 +104,7 @@ def _reading_file() -> FileDescriptorProto:
     return file
 
 
-READING_FILE = _reading_file()
+READING_FILE = _make_reading_file()
 _pool.Add(READING_FILE)
 _FRAME_META: Mapping[str, FieldDescriptorProto.Type.ValueType] = {
     "channel": STRING,
@@ -128,19 +128,19 @@ _FRAME_META: Mapping[str, FieldDescriptorProto.Type.ValueType] = {
 
 
 # The description of a frame, and with it the last reading of each temperature and position of the stand.
-FRAME_META_CLASS = _class_of(
+FRAME_META_CLASS = _make_class(
     "FrameMeta",
     [
-        *(field(name, number, kind) for number, (name, kind) in enumerate(_FRAME_META.items(), 1)),
-        repeated("readings", len(_FRAME_META) + 1, ".thermostand.Reading"),
+        *(make_field(name, number, kind) for number, (name, kind) in enumerate(_FRAME_META.items(), 1)),
+        make_repeated_field("readings", len(_FRAME_META) + 1, ".thermostand.Reading"),
     ],
     "Reading",
 )
-_FrameTable = _class_of("FrameTable", [repeated("frames", 1, ".thermostand.FrameMeta")], "FrameMeta")
-_Step = _plain_class(
+_FrameTable = _make_class("FrameTable", [make_repeated_field("frames", 1, ".thermostand.FrameMeta")], "FrameMeta")
+_Step = _make_plain_class(
     "Step", {"step_id": STRING, "index": INT32, "kind": STRING, "state": STRING, "parameters_json": STRING}
 )
-_Event = _plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING, "data_json": STRING})
+_Event = _make_plain_class("Event", {"level": STRING, "kind": STRING, "text": STRING, "data_json": STRING})
 
 # Topic of the telemetry series, but for the readings of devices -> message class.
 CLASSES: Mapping[str, type[Message]] = {
@@ -155,20 +155,20 @@ CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "ala
 LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 
-def canonical(value: float) -> float:
+def canonicalise(value: float) -> float:
     """One bit pattern for every NaN: equal readings are equal bytes."""
     return math.nan if value != value else value
 
 
-def remarked(remark: Any) -> Reading:
+def decode_remark(remark: Any) -> Reading:
     """The inverse of remark_of; SessionError when it is none."""
     cause = CAUSES.get(remark.cause, "")
-    return reading_of(
+    return make_reading(
         remark.channel, remark.value, remark.unit, remark.time_ns, remark.quality, reason=remark.reason, cause=cause
     )
 
 
-def reading_of(
+def make_reading(
     channel: str, value: float, unit: str, time_ns: int, quality: int, *, reason: str = "", cause: Cause = ""
 ) -> Reading:
     """A recorded reading; SessionError when its value does not fit its quality."""
@@ -212,40 +212,40 @@ _BEHIND_FLAGS = attrgetter(*list(_FRAME_META)[_FLAGS_PLACE + 1 :])
 def encode_frame_meta(meta: FrameMeta, readings: Iterable[Reading] = ()) -> bytes:
     """The description as a message, with what the stand read last before the frame was published."""
     fields: dict[str, Any] = {name: getattr(meta, name) for name in _FRAME_META}
-    fields |= {name: canonical(fields[name]) for name in ("chamber_degC", "camera_degC", "exposure_s", "gain_dB")}
-    fields |= {"flags": ",".join(meta.flags), "readings": list(map(remark_of, readings))}
+    fields |= {name: canonicalise(fields[name]) for name in ("chamber_degC", "camera_degC", "exposure_s", "gain_dB")}
+    fields |= {"flags": ",".join(meta.flags), "readings": list(map(encode_remark, readings))}
     return FRAME_META_CLASS(**fields).SerializeToString()
 
 
 def decode_frame_meta(data: bytes) -> FrameMeta:
     """The inverse of encode_frame_meta; SessionError when it is not one."""
     try:
-        return _frame_meta(FRAME_META_CLASS.FromString(data))
+        return _build_frame_meta(FRAME_META_CLASS.FromString(data))
     except DecodeError as error:
         raise SessionError(f"a frame's description cannot be read ({error})") from error
 
 
-def _frame_meta(message: Message) -> FrameMeta:
+def _build_frame_meta(message: Message) -> FrameMeta:
     before, flags, behind = _BEFORE_FLAGS(message), _get(message, "flags"), _BEHIND_FLAGS(message)
     values: list[Any] = [*before, tuple(flags.split(",")) if flags else (), *behind]
     return FrameMeta(*values)
 
 
-def frame_table(descriptions: Iterable[bytes]) -> bytes:
+def encode_frame_table(descriptions: Iterable[bytes]) -> bytes:
     """The descriptions of a segment's frames, in their order, as one message."""
-    parts = ((b"\x0a", varint(len(description)), description) for description in descriptions)
+    parts = ((b"\x0a", encode_varint(len(description)), description) for description in descriptions)
     return b"".join(chain.from_iterable(parts))
 
 
 def decode_frame_table(data: bytes) -> list[FrameMeta]:
     """The inverse; SessionError when it is none."""
     try:
-        return list(map(_frame_meta, _get(_FrameTable.FromString(data), "frames")))
+        return list(map(_build_frame_meta, _get(_FrameTable.FromString(data), "frames")))
     except DecodeError as error:
         raise SessionError(f"the table of frames cannot be read ({error})") from error
 
 
-def varint(number: int) -> bytes:
+def encode_varint(number: int) -> bytes:
     """Protobuf's encoding of a length: seven bits a byte, the lowest first, the top bit set on all but the last."""
     encoded = bytearray()
     while number > 0x7F:
@@ -255,11 +255,11 @@ def varint(number: int) -> bytes:
     return bytes(encoded)
 
 
-def remark_of(reading: Reading) -> dict[str, object]:
+def encode_remark(reading: Reading) -> dict[str, object]:
     """A reading in full, as the fields of a message."""
     return {
         "channel": reading.channel,
-        "value": canonical(reading.value),
+        "value": canonicalise(reading.value),
         "unit": reading.unit,
         "time_ns": reading.time_ns,
         "quality": QUALITY_NUMBER[reading.quality],
@@ -282,7 +282,7 @@ def encode_step(mark: StepMark) -> bytes:
 def decode_step(data: bytes, time_ns: int) -> StepMark:
     """The inverse of encode_step; SessionError when it is not one."""
     m = _parse(STEP, data)
-    parameters = _json_object(_get(m, "parameters_json"), "step")
+    parameters = _parse_json_object(_get(m, "parameters_json"), "step")
     try:
         state = StepState(_get(m, "state"))
     except ValueError as error:
@@ -290,7 +290,7 @@ def decode_step(data: bytes, time_ns: int) -> StepMark:
     return StepMark(time_ns, _get(m, "step_id"), _get(m, "index"), _get(m, "kind"), state, parameters)
 
 
-def _json_object(text: str, what: str) -> dict[str, object]:
+def _parse_json_object(text: str, what: str) -> dict[str, object]:
     """The keys and values of a JSON text; SessionError when it is none."""
     try:
         found = json.loads(text)
@@ -310,19 +310,21 @@ def encode_event(event: Event) -> bytes:
 def decode_event(data: bytes, time_ns: int) -> Event:
     """The inverse of encode_event; SessionError when it is not one."""
     message = _parse(EVENT, data)
-    fields = _json_object(_get(message, "data_json") or "{}", "event")
+    fields = _parse_json_object(_get(message, "data_json") or "{}", "event")
     return Event(time_ns, _get(message, "level"), _get(message, "kind"), _get(message, "text"), fields)
 
 
 def encode_log(event: Event) -> bytes:
     """The event as foxglove.Log, for the viewers' log panels."""
     level = LOG_LEVEL.get(event.level, Log.UNKNOWN)
-    return Log(timestamp=timestamp(event.time_ns), level=level, name=event.kind, message=event.text).SerializeToString()
+    return Log(
+        timestamp=make_timestamp(event.time_ns), level=level, name=event.kind, message=event.text
+    ).SerializeToString()
 
 
 def encode_original(original: Original) -> bytes:
     """A picture as its file was, as foxglove.CompressedImage whose frame is `device/name`."""
-    stamp, frame = timestamp(original.time_ns), f"{original.device}/{original.name}"
+    stamp, frame = make_timestamp(original.time_ns), f"{original.device}/{original.name}"
     return CompressedImage(timestamp=stamp, frame_id=frame, data=original.data, format="jpeg").SerializeToString()
 
 
@@ -335,12 +337,12 @@ def decode_original(data: bytes, time_ns: int) -> Original:
 
 def encode_table_pose(time_ns: int, linear_mm: float, rotary_deg: float) -> bytes:
     """Where the table is, as foxglove.PoseInFrame in `stand`: x along the linear axis in m, rotation about z."""
-    pose = _table_pose(linear_mm, rotary_deg)
-    return PoseInFrame(timestamp=timestamp(time_ns), frame_id="stand", pose=pose).SerializeToString()
+    pose = _make_table_pose(linear_mm, rotary_deg)
+    return PoseInFrame(timestamp=make_timestamp(time_ns), frame_id="stand", pose=pose).SerializeToString()
 
 
 @lru_cache(1)
-def _table_pose(linear_mm: float, rotary_deg: float) -> Pose:
+def _make_table_pose(linear_mm: float, rotary_deg: float) -> Pose:
     """A table stands still most of the time."""
     half_rad = math.radians(rotary_deg) / 2
     return Pose(
@@ -348,7 +350,7 @@ def _table_pose(linear_mm: float, rotary_deg: float) -> Pose:
     )
 
 
-def timestamp(time_ns: int) -> Timestamp:
+def make_timestamp(time_ns: int) -> Timestamp:
     """An instant in Foxglove's messages."""
     seconds, nanos = divmod(time_ns, NS_PER_S)
     return Timestamp(seconds=seconds, nanos=nanos)

@@ -20,8 +20,8 @@ from mcap.records import Attachment, Channel, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.format.batches import READINGS, BatchForm, form_of
-from thermostand.recording.format.damage import FileDamaged, naming, reading
+from thermostand.recording.format.batches import READINGS, BatchSchema, parse_batch_schema
+from thermostand.recording.format.damage import FileDamaged, convert_damage, name_file_in_errors
 from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
 from thermostand.recording.format.layout import (
     FRAME_TABLE,
@@ -29,7 +29,7 @@ from thermostand.recording.format.layout import (
     SEGMENT_METADATA,
     SEQUENCE_MASK,
     SESSION_METADATA,
-    contradicts,
+    is_contradicting,
 )
 from thermostand.recording.format.mcap_bytes import (
     CHUNK_LIMIT_BYTES,
@@ -37,10 +37,10 @@ from thermostand.recording.format.mcap_bytes import (
     RECORD,
     ChunkHead,
     check_attachment,
-    chunk_content,
-    chunk_head,
-    records,
-    stream,
+    decompress_chunk,
+    iterate_records,
+    make_stream,
+    parse_chunk_head,
 )
 from thermostand.recording.format.messages import CLASSES, FrameMeta, decode_frame_meta, decode_frame_table
 from thermostand.recording.format.summary import ChunkPlace, Summary, read_summary
@@ -63,7 +63,7 @@ class RecordedMessage:
     sequence: int
     time_ns: int
     data: bytes
-    form: BatchForm | None = None
+    form: BatchSchema | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,10 +108,10 @@ class FramePlace:
 
 def read_head(path: Path) -> Head:
     """Metadata `session` and the attachments of a finished segment."""
-    with reading(path), path.open("rb") as file:
+    with convert_damage(path), path.open("rb") as file:
         summary = _open(path, file)
-        head = _head(path, file, summary)
-        if len(head.attachments) != summary.statistics.attachment_count - (FRAME_TABLE in summary.attachments()):
+        head = _read_head(path, file, summary)
+        if len(head.attachments) != summary.statistics.attachment_count - (FRAME_TABLE in summary.parse_attachments()):
             raise ValueError("its attachments are not those that its index lists")
         return head
 
@@ -129,7 +129,7 @@ def _open(path: Path, file: BinaryIO) -> Summary:
     return summary
 
 
-def _head(path: Path, file: BinaryIO, summary: Summary) -> Head:
+def _read_head(path: Path, file: BinaryIO, summary: Summary) -> Head:
     size = path.stat().st_size
     found: dict[str, dict[str, str]] = {}
     attachments: dict[str, str] = {}
@@ -140,15 +140,15 @@ def _head(path: Path, file: BinaryIO, summary: Summary) -> Head:
         content = file.read(min(length, size))
         if opcode == Opcode.ATTACHMENT:
             check_attachment(content)
-            attachment = Attachment.read(stream(content))
+            attachment = Attachment.read(make_stream(content))
             attachments[attachment.name] = attachment.data.decode()
         elif opcode == Opcode.METADATA:
-            name, values = _metadata(content)
+            name, values = _parse_metadata(content)
             found[name] = dict(values)
     session = found.get(SESSION_METADATA)
     if session is None:
         raise SessionError(f"{path}: not a segment of a thermostand session")
-    if contradicts(found.get(SEGMENT_METADATA, {}), session):
+    if is_contradicting(found.get(SEGMENT_METADATA, {}), session):
         raise ValueError("the session's metadata do not fit their CRC")
     totals = summary.statistics
     span = MessageSpan(totals.message_count, totals.message_start_time, totals.message_end_time)
@@ -156,60 +156,60 @@ def _head(path: Path, file: BinaryIO, summary: Summary) -> Head:
 
 
 @lru_cache(16)  # each segment of a session has the session's
-def _metadata(content: bytes) -> tuple[str, Mapping[str, str]]:
+def _parse_metadata(content: bytes) -> tuple[str, Mapping[str, str]]:
     """Its name, and what it says."""
-    metadata = Metadata.read(stream(content))
+    metadata = Metadata.read(make_stream(content))
     return metadata.name, metadata.metadata
 
 
-def telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[RecordedMessage]:
+def read_telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[RecordedMessage]:
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
-    with reading(path), path.open("rb") as file:
+    with convert_damage(path), path.open("rb") as file:
         summary = _open(path, file)
         topics = {
-            number: (channel.topic, recorded_form(channel))
-            for number, (channel, _) in _channels(summary).items()
+            number: (channel.topic, find_batch_schema(channel))
+            for number, (channel, _) in _map_channels(summary).items()
             if wanted(channel)
         }
         counts = dict.fromkeys(topics, 0)
-        for place in summary.chunks():
+        for place in summary.iterate_chunks():
             if topics.keys().isdisjoint(place.channels):
                 continue
-            chunk = _chunk(file, place)
-            for number, offset, end in _message_places(chunk, topics):
+            chunk = _read_chunk(file, place)
+            for number, offset, end in _locate_messages(chunk, topics):
                 counts[number] += 1
-                yield _message(*topics[number], chunk, offset, end)
+                yield _make_message(*topics[number], chunk, offset, end)
         if counts != {number: summary.statistics.channel_message_counts.get(number, 0) for number in topics}:
             raise ValueError("it does not hold the messages that its index lists")
 
 
-def _channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
+def _map_channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
     """Channel id -> channel and schema; ValueError when a topic of ours holds messages that are not."""
     channels = summary.channels()
     for channel, schema in channels.values():
-        form = recorded_form(channel)
+        form = find_batch_schema(channel)
         known = SCHEMAS.get(channel.topic) if form is None else form.message.DESCRIPTOR.full_name
         if known is not None and schema != known:
             raise ValueError(f"{channel.topic} holds {schema}, not {known}")
     return channels
 
 
-def recorded_form(channel: Channel) -> BatchForm | None:
+def find_batch_schema(channel: Channel) -> BatchSchema | None:
     """How the readings of a device are recorded on a channel, None when it has no readings; ValueError when it does not
     say it."""
-    return form_of(channel.metadata) if channel.topic.startswith(READINGS) else None
+    return parse_batch_schema(channel.metadata) if channel.topic.startswith(READINGS) else None
 
 
-def _chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
+def _read_chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
     """The records of the chunk at that place, their CRC checked."""
-    data = memoryview(_read(file, place.offset, place.length))
+    data = memoryview(_read_exactly(file, place.offset, place.length))
     _check_place(data, place)
-    head, content = chunk_content(data[RECORD.size :])
+    head, content = decompress_chunk(data[RECORD.size :])
     _check_times(head, place)
     return content
 
 
-def _read(file: BinaryIO, offset: int, length: int) -> bytes:
+def _read_exactly(file: BinaryIO, offset: int, length: int) -> bytes:
     """So many bytes from there; ValueError when there are fewer, before memory is taken for them."""
     if length > CHUNK_LIMIT_BYTES or offset + length > os.fstat(file.fileno()).st_size:
         raise ValueError(f"{length} bytes at {offset} are not in the file")
@@ -229,7 +229,7 @@ def _check_times(head: ChunkHead, place: ChunkPlace) -> None:
         raise ValueError("the index points to another chunk")
 
 
-def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int, int, int]]:
+def _locate_messages(chunk: memoryview, wanted: Container[int]) -> list[tuple[int, int, int]]:
     """(channel id, offset, end) of each message record of the wanted channels in a chunk."""
     # Every record of a night passes here, so the loop has no call but one.
     unpack = _MESSAGE_START.unpack_from
@@ -246,26 +246,28 @@ def _message_places(chunk: memoryview, wanted: Container[int]) -> list[tuple[int
     return found
 
 
-def _message(topic: str, form: BatchForm | None, chunk: memoryview, offset: int, end: int) -> RecordedMessage:
+def _make_message(topic: str, form: BatchSchema | None, chunk: memoryview, offset: int, end: int) -> RecordedMessage:
     sequence, time_ns, _ = _MESSAGE_REST.unpack_from(chunk, offset + _MESSAGE_START.size)
     return RecordedMessage(topic, sequence, time_ns, bytes(chunk[offset + _MESSAGE_BYTES : end]), form)
 
 
-def frame_places(path: Path) -> list[FramePlace]:
+def list_frame_places(path: Path) -> list[FramePlace]:
     """The frames of a segment in the order of the file, from its table of them; no image is decompressed unless
     another program has written the file without one."""
-    with reading(path), path.open("rb") as file:
+    with convert_damage(path), path.open("rb") as file:
         summary = _open(path, file)
-        chunks = list(summary.chunks())
-        table = summary.attachments().get(FRAME_TABLE)
-        with naming(path):
+        chunks = list(summary.iterate_chunks())
+        table = summary.parse_attachments().get(FRAME_TABLE)
+        with name_file_in_errors(path):
             if table is None:
-                metas = [decode_frame_meta(bytes(frame_messages(_chunk(file, chunk))[0].data)) for chunk in chunks]
+                metas = [
+                    decode_frame_meta(bytes(parse_frame_messages(_read_chunk(file, chunk))[0].data)) for chunk in chunks
+                ]
             else:
-                metas = decode_frame_table(_attachment(file, *table).data)
+                metas = decode_frame_table(_read_attachment(file, *table).data)
         if len(metas) != len(chunks) or summary.statistics.message_count != 2 * len(chunks):
             raise ValueError("its chunks are not one frame each, or its table does not list them")
-        channels = _channels(summary)
+        channels = _map_channels(summary)
         if any([channels[number][1] for number in chunk.channels] != [META_SCHEMA, IMAGE_SCHEMA] for chunk in chunks):
             raise ValueError("its chunks are not of a description and an image")
         places = [FramePlace(path, chunk, meta) for chunk, meta in zip(chunks, metas, strict=True)]
@@ -274,24 +276,24 @@ def frame_places(path: Path) -> list[FramePlace]:
         return places
 
 
-def _attachment(file: BinaryIO, offset: int, length: int) -> Attachment:
-    data = _read(file, offset, length)
+def _read_attachment(file: BinaryIO, offset: int, length: int) -> Attachment:
+    data = _read_exactly(file, offset, length)
     if RECORD.unpack_from(data) != (Opcode.ATTACHMENT, length - RECORD.size):
         raise ValueError("the index does not point to an attachment")
     check_attachment(data[RECORD.size :])
-    return Attachment.read(stream(data[RECORD.size :]))
+    return Attachment.read(make_stream(data[RECORD.size :]))
 
 
-def frame_crcs(path: Path, places: Sequence[FramePlace]) -> list[int]:
+def read_frame_crcs(path: Path, places: Sequence[FramePlace]) -> list[int]:
     """The CRCs that frames of one segment are said to have, by the heads of their chunks; no frame is read."""
-    with reading(path), path.open("rb", buffering=0) as file:
-        return [_frame_head(file, place.chunk).crc for place in places]
+    with convert_damage(path), path.open("rb", buffering=0) as file:
+        return [_read_frame_head(file, place.chunk).crc for place in places]
 
 
-def _frame_head(file: BinaryIO, chunk: ChunkPlace) -> ChunkHead:
-    data = _read(file, chunk.offset, min(chunk.length, _CHUNK_HEAD_BYTES))
+def _read_frame_head(file: BinaryIO, chunk: ChunkPlace) -> ChunkHead:
+    data = _read_exactly(file, chunk.offset, min(chunk.length, _CHUNK_HEAD_BYTES))
     _check_place(data, chunk)
-    head = chunk_head(memoryview(data)[RECORD.size :], chunk.length - RECORD.size)
+    head = parse_chunk_head(memoryview(data)[RECORD.size :], chunk.length - RECORD.size)
     _check_times(head, chunk)
     return head
 
@@ -305,9 +307,9 @@ class StoredFrame(NamedTuple):
 
 def read_frame(place: FramePlace) -> StoredFrame:
     """The messages of the frame at that place, the CRC of its chunk checked."""
-    with reading(place.path), place.path.open("rb", buffering=0) as file:
-        meta, image = frame_messages(_chunk(file, place.chunk))
-        with naming(place.path):
+    with convert_damage(place.path), place.path.open("rb", buffering=0) as file:
+        meta, image = parse_frame_messages(_read_chunk(file, place.chunk))
+        with name_file_in_errors(place.path):
             stored = decode_frame_meta(bytes(meta.data))
         if repr(stored) != repr(place.meta):  # NaN is not equal to itself
             raise ValueError("the table of frames lists another frame")
@@ -325,10 +327,10 @@ class FrameMessage(NamedTuple):
     data: memoryview
 
 
-def frame_messages(chunk: memoryview) -> tuple[FrameMessage, FrameMessage]:
+def parse_frame_messages(chunk: memoryview) -> tuple[FrameMessage, FrameMessage]:
     """The description and the image in a frame's chunk; ValueError when it holds something else."""
     found: list[FrameMessage] = []
-    for opcode, record in records(chunk):
+    for opcode, record in iterate_records(chunk):
         if opcode == Opcode.MESSAGE:
             sequence, time_ns, _ = _MESSAGE_REST.unpack_from(record, 2)
             found.append(FrameMessage(sequence, time_ns, record[MESSAGE.size :]))

@@ -16,7 +16,14 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from thermostand.recording.format.mcap_bytes import CRC, RECORD, RECORD_LIMIT_BYTES, check_crc, records, stream
+from thermostand.recording.format.mcap_bytes import (
+    CRC,
+    RECORD,
+    RECORD_LIMIT_BYTES,
+    check_crc,
+    iterate_records,
+    make_stream,
+)
 
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, begin of its offsets; a CRC follows
 _FOOTER_BYTES = _FOOTER.size + CRC.size + len(MCAP0_MAGIC)
@@ -61,64 +68,66 @@ class Summary:
         """Channel id -> the channel and its schema's name; ValueError or LookupError when they do not fit together."""
         schemas: dict[int, str] = {}
         channels: list[Channel] = []
-        for opcode, record in records(self.content):
+        for opcode, record in iterate_records(self.content):
             if opcode == Opcode.SCHEMA:
-                number, name = _schema(bytes(record))
+                number, name = _parse_schema(bytes(record))
                 schemas[number] = name
             elif opcode == Opcode.CHANNEL:
-                channels.append(_channel(bytes(record)))
+                channels.append(_parse_channel(bytes(record)))
             elif opcode == Opcode.CHUNK_INDEX:
                 break  # of these there may be thousands, and no more channels behind them
         return {channel.id: (channel, schemas[channel.schema_id]) for channel in channels}
 
-    def attachments(self) -> dict[str, tuple[int, int]]:
+    def parse_attachments(self) -> dict[str, tuple[int, int]]:
         """Name -> where its record is, and how long; of one name the last."""
         found: dict[str, tuple[int, int]] = {}
-        for opcode, record in records(self.content):
+        for opcode, record in iterate_records(self.content):
             if opcode == Opcode.ATTACHMENT_INDEX:
                 offset, length, _, _, _, name_bytes = _ATTACHMENT_INDEX.unpack_from(record)
                 begin = _ATTACHMENT_INDEX.size
                 found[bytes(record[begin : begin + name_bytes]).decode()] = offset, length
         return found
 
-    def chunks(self) -> Iterator[ChunkPlace]:
+    def iterate_chunks(self) -> Iterator[ChunkPlace]:
         """The chunks in the order of the file."""
-        for opcode, record in records(self.content):
+        for opcode, record in iterate_records(self.content):
             if opcode == Opcode.CHUNK_INDEX:
                 first_ns, last_ns, offset, length, map_bytes = _CHUNK_INDEX.unpack_from(record)
-                yield ChunkPlace(first_ns, last_ns, offset, length, tuple(_map(record, _CHUNK_INDEX.size, map_bytes)))
+                yield ChunkPlace(
+                    first_ns, last_ns, offset, length, tuple(_parse_map(record, _CHUNK_INDEX.size, map_bytes))
+                )
 
 
 # Segments of one session, and mostly of all, have the same schemas and channels: a list of sessions decodes them once.
 @lru_cache(256)
-def _schema(record: bytes) -> tuple[int, str]:
+def _parse_schema(record: bytes) -> tuple[int, str]:
     """Its number and its name."""
-    schema = Schema.read(stream(record))
+    schema = Schema.read(make_stream(record))
     return schema.id, schema.name
 
 
 @lru_cache(1024)
-def _channel(record: bytes) -> Channel:
+def _parse_channel(record: bytes) -> Channel:
     """Shared by all that ask, so not to be changed."""
-    return Channel.read(stream(record))
+    return Channel.read(make_stream(record))
 
 
 def read_summary(file: BinaryIO, size_bytes: int) -> Summary:
     """The summary of a finished segment of that size; ValueError, struct.error or EOFError when it is damaged."""
-    begin, content = _summary_bytes(file, size_bytes)
-    record = next((record for opcode, record in records(content) if opcode == Opcode.STATISTICS), None)
+    begin, content = _read_summary_bytes(file, size_bytes)
+    record = next((record for opcode, record in iterate_records(content) if opcode == Opcode.STATISTICS), None)
     if record is None:
         raise ValueError("the index has no statistics")
     count, _, _, attachments, _, _, first_ns, last_ns, map_bytes = _STATISTICS.unpack_from(record)
-    counts = _map(record, _STATISTICS.size, map_bytes)
+    counts = _parse_map(record, _STATISTICS.size, map_bytes)
     return Summary(Statistics(count, attachments, first_ns, last_ns, counts), begin, content)
 
 
-def _map(record: memoryview, begin: int, size_bytes: int) -> dict[int, int]:
+def _parse_map(record: memoryview, begin: int, size_bytes: int) -> dict[int, int]:
     return dict(_MAP_ENTRY.iter_unpack(record[begin : begin + size_bytes]))
 
 
-def _summary_bytes(file: BinaryIO, size_bytes: int) -> tuple[int, memoryview]:
+def _read_summary_bytes(file: BinaryIO, size_bytes: int) -> tuple[int, memoryview]:
     """Where the summary begins, and its records, their CRC checked, which covers the footer before the CRC, too."""
     tail_begin = max(0, size_bytes - _TAIL_BYTES)
     file.seek(tail_begin)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import CLOCK_STEP
-from thermostand.foundation.instants import date_time, local_text, utc_text
+from thermostand.foundation.instants import format_date_time, format_local, format_utc
 from thermostand.foundation.items import Event
 
 REPEATED_NS = 300 * NS_PER_S  # as long as the offset is not 0
@@ -56,31 +56,31 @@ class UtcOffsets:
 
     def date_time(self, stand_ns: int) -> str:
         """`2026-01-01 19:00:04`, local time to the second below."""
-        return date_time(self.utc_ns(stand_ns))
+        return format_date_time(self.utc_ns(stand_ns))
 
     def local_text(self, stand_ns: int) -> str:
         """The same with its zone: `2026-01-01 19:00:04 CET`."""
-        return local_text(self.utc_ns(stand_ns))
+        return format_local(self.utc_ns(stand_ns))
 
     def utc_text(self, stand_ns: int) -> str:
         """UTC in ISO 8601 to the ns."""
-        return utc_text(self.utc_ns(stand_ns))
+        return format_utc(self.utc_ns(stand_ns))
 
 
-def offsets_of(events: Iterable[Event]) -> UtcOffsets:
+def collect_offsets(events: Iterable[Event]) -> UtcOffsets:
     """What the events of a session say; one whose data cannot be understood says nothing."""
-    steps = sorted(step for event in events if event.kind == CLOCK_STEP and (step := _step(event)) is not None)
+    steps = sorted(step for event in events if event.kind == CLOCK_STEP and (step := _parse_step(event)) is not None)
     if not steps:
         return UtcOffsets()
     return UtcOffsets(steps[0][1], tuple(step[0] for step in steps), tuple(step[2] for step in steps))
 
 
-def offset_event(time_ns: int, offset_ns: int) -> Event:
+def make_offset_event(time_ns: int, offset_ns: int) -> Event:
     """That the offset is this one still, for a segment or a part that begins with it."""
-    return step_event(time_ns, offset_ns, offset_ns, time_ns)
+    return make_step_event(time_ns, offset_ns, offset_ns, time_ns)
 
 
-def step_event(time_ns: int, before_ns: int, after_ns: int, seen_ns: int) -> Event:
+def make_step_event(time_ns: int, before_ns: int, after_ns: int, seen_ns: int) -> Event:
     """That the offset is `after_ns` now, and was before_ns until seen_ns."""
     return CLOCK_STEP.at(
         time_ns,
@@ -92,7 +92,7 @@ def step_event(time_ns: int, before_ns: int, after_ns: int, seen_ns: int) -> Eve
     )
 
 
-def _step(event: Event) -> tuple[int, int, int] | None:
+def _parse_step(event: Event) -> tuple[int, int, int] | None:
     """From when on, the offset before and after, ns."""
     before, after = event.data.get("offset_before_ns"), event.data.get("offset_after_ns")
     if isinstance(before, int) and isinstance(after, int):

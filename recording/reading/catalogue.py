@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.version import installed_version
+from thermostand.foundation.version import read_version
 from thermostand.recording.format.inventory import is_locked
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.format.layout import DAMAGED, FINISHED, FRAMES, TELEMETRY, UNFINISHED
@@ -101,9 +101,9 @@ class ListedSession:
         return next((copy.to for copy in reversed(self.copies) if copy.contents == self.contents), "")
 
 
-def entry_of(seen: Scan, contents: str = "") -> ListedSession:
+def make_entry(seen: Scan, contents: str = "") -> ListedSession:
     """What a list shows of a session that was looked at."""
-    from thermostand.recording.reading.run_word import Files
+    from thermostand.recording.reading.run_status import Files
 
     said = read_notes(seen.path)
     return ListedSession(
@@ -124,24 +124,24 @@ def entry_of(seen: Scan, contents: str = "") -> ListedSession:
         segments_json=json.dumps([(file.name, str(file.state), file.size_bytes) for file in seen.inventory]),
         troubles=seen.sentences(Files.DAMAGED),
         missing=seen.sentences(Files.INCOMPLETE),
-        contents=contents or contents_of(seen.path),
+        contents=contents or compute_contents_digest(seen.path),
         notes=said.notes,
         tags=said.tags,
         copies=said.archived,
     )
 
 
-Memory = dict[Path, tuple[str, ListedSession]]  # a digest of the files, and what was made of them
+SessionCache = dict[Path, tuple[str, ListedSession]]  # a digest of the files, and what was made of them
 
 
-def catalogue(
-    folder: Path, report: Callable[[int], Report] | None = None, memory: Memory | None = None
+def load_catalogue(
+    folder: Path, report: Callable[[int], Report] | None = None, memory: SessionCache | None = None
 ) -> list[ListedSession]:
     """The sessions in `folder`, the oldest first. `report`: called with how many must be looked at, gives what is
     called with the progress. memory: takes what is new in place of the index, for who must not wait for a disk that
     hangs. Blocking; OSError when the folder cannot be read."""
-    found = {path: (inode, files) for path, inode in _folders(folder) if (files := _files(path)) is not None}
-    digests = {path: _digest(files) for path, files in found.items()}
+    found = {path: (inode, files) for path, inode in _list_folders(folder) if (files := _list_files(path)) is not None}
+    digests = {path: _compute_digest(files) for path, files in found.items()}
     with closing(_Index(folder, memory)) as index:
         known = {path: entry for path in found if (entry := index.get(path, digests[path])) is not None}
         new = [path for path in found if path not in known]
@@ -160,20 +160,20 @@ def look_at(path: Path) -> ListedSession:
     """The session in `path`, whatever an index says; SessionError when there is none."""
     from thermostand.recording.reading.scan import scan  # takes half a second to import
 
-    return entry_of(scan(path))
+    return make_entry(scan(path))
 
 
-def contents_of(path: Path) -> str:
+def compute_contents_digest(path: Path) -> str:
     """Names and sizes of a session's segments and journal as a digest: the same of a complete copy of them."""
-    files = _files(path)
+    files = _list_files(path)
     return (
         ""
         if files is None
-        else _digest([(name, size) for name, size, *_ in files if "/" in name or name == JOURNAL_NAME])
+        else _compute_digest([(name, size) for name, size, *_ in files if "/" in name or name == JOURNAL_NAME])
     )
 
 
-def _folders(folder: Path) -> Iterator[tuple[Path, int]]:
+def _list_folders(folder: Path) -> Iterator[tuple[Path, int]]:
     """Each with its number: another folder of the same name has another one."""
     with os.scandir(folder) as entries:
         found = [(entry.name, entry.inode()) for entry in entries if entry.is_dir()]
@@ -184,7 +184,7 @@ def _is_deleted(name: str) -> bool:
     return name.startswith(".") and name.endswith(DELETED)
 
 
-def _files(path: Path) -> list[_File] | None:
+def _list_files(path: Path) -> list[_File] | None:
     """Those that a session consists of; None when there is no segment. One that a living recorder has open counts as
     another file."""
     found: list[_File] = []
@@ -212,17 +212,17 @@ def _files(path: Path) -> list[_File] | None:
     return found
 
 
-def _digest(values: object) -> str:
+def _compute_digest(values: object) -> str:
     return hashlib.blake2b(repr(values).encode(errors="surrogateescape"), digest_size=16).hexdigest()
 
 
 class _Index:
     """The file; every trouble with it means that nothing is known."""
 
-    def __init__(self, folder: Path, memory: Memory | None) -> None:
+    def __init__(self, folder: Path, memory: SessionCache | None) -> None:
         self._path = folder / INDEX_NAME
         self._memory = memory
-        self._version = f"{_VERSION} {installed_version()}"
+        self._version = f"{_VERSION} {read_version()}"
         self._rows: dict[bytes, tuple[str, str]] = {}
         self._new: dict[bytes, tuple[str, str]] = {}
         self._gone: set[bytes] = set()
@@ -239,7 +239,7 @@ class _Index:
         if found is None or found[0] != self._seal(name, files, found[1]):
             return None
         try:
-            return _decoded(path, found[1])
+            return _decode(path, found[1])
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
 
@@ -248,7 +248,7 @@ class _Index:
         if self._memory is not None:
             self._memory[path] = files, entry
             return
-        self._new[os.fsencode(path.name)] = (files, _encoded(entry))
+        self._new[os.fsencode(path.name)] = (files, _encode(entry))
 
     def keep(self, found: Mapping[Path, object]) -> None:
         """Forget all others."""
@@ -266,14 +266,14 @@ class _Index:
             if not self._is_ours() or not self._rows:
                 for name in (INDEX_NAME, f"{INDEX_NAME}-journal"):  # one of its changes must not be undone in a new one
                     self._path.with_name(name).unlink(missing_ok=True)
-            with closing(self._opened()) as opened, opened:
+            with closing(self._open()) as opened, opened:
                 if not opened.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
                     opened.execute(_SCHEMA)
                 opened.executemany("DELETE FROM sessions WHERE name = ?", [(name,) for name in self._gone])
                 rows = [(name, self._seal(name, files, text), text) for name, (files, text) in self._new.items()]
                 opened.executemany("INSERT OR REPLACE INTO sessions VALUES (?, ?, ?)", rows)
 
-    def _opened(self) -> sqlite3.Connection:
+    def _open(self) -> sqlite3.Connection:
         opened = sqlite3.connect(self._path, timeout=_BUSY_S)
         opened.execute("PRAGMA trusted_schema = OFF")
         return opened
@@ -298,17 +298,17 @@ class _Index:
 
     def _seal(self, name: bytes, files: str, text: str) -> str:
         """What a row was made by, of which files, and all that it says: the database itself has no checksums."""
-        return _digest((self._version, name, files, text))
+        return _compute_digest((self._version, name, files, text))
 
 
-def _encoded(entry: ListedSession) -> str:
+def _encode(entry: ListedSession) -> str:
     values = {field.name: getattr(entry, field.name) for field in fields(entry) if field.name != "path"}
     for name in ("notes", "copies"):
         values[name] = [asdict(each) for each in values[name]]
     return json.dumps(values)
 
 
-def _decoded(path: Path, text: str) -> ListedSession:
+def _decode(path: Path, text: str) -> ListedSession:
     """ValueError, TypeError, KeyError or AttributeError when the text is none."""
     values = cast("dict[str, Any]", json.loads(text))
     notes = tuple(Note(**each) for each in values.pop("notes"))

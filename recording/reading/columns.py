@@ -20,7 +20,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Batch
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchForm, name_apart
+from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchSchema, name_apart
 from thermostand.recording.format.records import RecordedMessage
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ Part = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]  # numbe
 class _Rows:
     """The plain messages of one form: of each its number, its time, its values and their qualities."""
 
-    form: BatchForm
+    form: BatchSchema
     values_of: Callable[[Any], Iterable[float]] = field(init=False)
     qualities_of: Callable[[Any], Iterable[int]] = field(init=False)
     numbers: array[int] = field(default_factory=lambda: array("q"))
@@ -74,7 +74,7 @@ class ReadingColumns:
     """
 
     def __init__(self) -> None:
-        self._rows: dict[BatchForm, _Rows] = {}
+        self._rows: dict[BatchSchema, _Rows] = {}
         self._single: dict[
             tuple[str, str], list[tuple[int, int, float]]
         ] = {}  # (device, channel) -> number, time, value
@@ -92,7 +92,7 @@ class ReadingColumns:
         if rows is None:
             rows = self._rows[form] = _Rows(form)
             for each in form.device.channels:
-                self._named(f"{form.name}.{each.name}", each.unit)
+                self._name_channel(f"{form.name}.{each.name}", each.unit)
         try:
             found: Any = form.message.FromString(message.data)
         except DecodeError:
@@ -106,7 +106,7 @@ class ReadingColumns:
             rows.values.extend(rows.values_of(found))
             rows.qualities.extend(rows.qualities_of(found))
 
-    def _named(self, channel: str, unit: str) -> str:
+    def _name_channel(self, channel: str, unit: str) -> str:
         """What a channel is called that is read in this unit."""
         name = name_apart(channel, unit, self.units.setdefault(channel, unit))
         self.units[name] = unit
@@ -114,7 +114,7 @@ class ReadingColumns:
 
     def _add_singly(self, batch: Batch) -> None:
         for reading in batch.readings:
-            channel = self._named(reading.channel, reading.unit)
+            channel = self._name_channel(reading.channel, reading.unit)
             if reading.cause == "doubt":
                 self.doubted.setdefault(channel, []).append(reading.time_ns)
             single = self._single.setdefault((batch.device, channel), [])
@@ -125,7 +125,7 @@ class ReadingColumns:
         when a value does not fit its quality."""
         parts: dict[tuple[str, str], list[Part]] = {}
         for form, rows in self._rows.items():
-            for channel, part in self._parts(form, rows):
+            for channel, part in self._iterate_parts(form, rows):
                 parts.setdefault((form.name, channel), []).append(part)
         for key, single in self._single.items():
             numbers, times_ns, values = zip(*single, strict=True)
@@ -133,10 +133,10 @@ class ReadingColumns:
             parts.setdefault(key, []).append(part)
         columns: dict[str, dict[str, ChannelColumn]] = {form.name: {} for form in self._rows}
         for (device, channel), of_channel in parts.items():
-            columns.setdefault(device, {})[channel] = _sorted(of_channel)
+            columns.setdefault(device, {})[channel] = _sort(of_channel)
         return columns
 
-    def _parts(self, form: BatchForm, rows: _Rows) -> Iterator[tuple[str, Part]]:
+    def _iterate_parts(self, form: BatchSchema, rows: _Rows) -> Iterator[tuple[str, Part]]:
         """Each channel of a device with its readings in the plain messages."""
         numbers, times_ns = np.array(rows.numbers), np.array(rows.times_ns)
         shape = (len(numbers), len(form.fields) + 1 if form.fields else 0)
@@ -144,7 +144,7 @@ class ReadingColumns:
         for index, each in enumerate(form.device.channels):
             is_given = all_qualities[:, index] != messages.ABSENT
             values, qualities = all_values[is_given, index], all_qualities[is_given, index]
-            channel = self._named(f"{form.name}.{each.name}", each.unit)
+            channel = self._name_channel(f"{form.name}.{each.name}", each.unit)
             is_wrong = (np.isnan(values) != (qualities == BAD)) | ~np.isin(qualities, KNOWN_QUALITIES)
             if is_wrong.any():
                 value, quality = values[is_wrong][0], qualities[is_wrong][0]
@@ -153,7 +153,7 @@ class ReadingColumns:
                 yield channel, (numbers[is_given], times_ns[is_given], values)
 
 
-def _sorted(parts: list[Part]) -> ChannelColumn:
+def _sort(parts: list[Part]) -> ChannelColumn:
     numbers, times_ns, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     order = np.lexsort((numbers, times_ns))
     return ChannelColumn(times_ns[order], values[order])

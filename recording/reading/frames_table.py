@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Event, StepMark
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.format.layout import FRAMES
 from thermostand.recording.format.records import FramePlace
-from thermostand.recording.format.restarts import begins_of, is_superseded
 from thermostand.recording.reading.columns import ChannelColumn
-from thermostand.recording.reading.interpolation import Float, interpolated
+from thermostand.recording.reading.interpolation import Float, interpolate
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -113,13 +113,13 @@ class RecordedSession(Protocol):
         ...
 
 
-def frames_table(session: RecordedSession, places: Sequence[FramePlace]) -> FramesTable:
+def build_frames_table(session: RecordedSession, places: Sequence[FramePlace]) -> FramesTable:
     """The table of the frames at these places."""
     metas = [place.meta for place in places]
     times_ns = np.array([meta.time_ns for meta in metas], np.int64)
     step_id = [meta.step_id for meta in metas]
     steps = {mark.step_id: mark.parameters for mark in session.steps() if "role" in mark.parameters}
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     named = zip(times_ns.tolist(), step_id, strict=True)
     return FramesTable(
         file=np.array([f"{FRAMES}/{place.path.name}" for place in places], np.str_),
@@ -128,26 +128,26 @@ def frames_table(session: RecordedSession, places: Sequence[FramePlace]) -> Fram
         step_id=np.array(step_id, np.str_),
         role=np.array([str(steps.get(name, {}).get("role") or "") for name in step_id], np.str_),
         superseded=np.array([is_superseded(time_ns, name, begins_ns) for time_ns, name in named], bool),
-        chamber_degC=np.array([_number(steps.get(name, {}).get("chamber_degC")) for name in step_id], np.float64),
+        chamber_degC=np.array([_to_float(steps.get(name, {}).get("chamber_degC")) for name in step_id], np.float64),
         camera_degC=np.array([meta.camera_degC for meta in metas], np.float64),
         flags=np.array([",".join(meta.flags) for meta in metas], np.str_),
-        air_degC=_at(session, _AIR, times_ns),
-        positions={axis: _at(session, f"{axis}.position", times_ns) for axis in _axes(session)},
+        air_degC=_interpolate_at(session, _AIR, times_ns),
+        positions={axis: _interpolate_at(session, f"{axis}.position", times_ns) for axis in _list_axes(session)},
     )
 
 
-def _number(value: object) -> float:
+def _to_float(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
-def _axes(session: RecordedSession) -> list[str]:
+def _list_axes(session: RecordedSession) -> list[str]:
     """The devices that report a position and whether they move."""
     channels = set(session.channels())
     return [name.removesuffix(".moving") for name in sorted(channels) if name.endswith(".moving")]
 
 
-def _at(session: RecordedSession, channel: str, times_ns: NDArray[np.int64]) -> Float:
+def _interpolate_at(session: RecordedSession, channel: str, times_ns: NDArray[np.int64]) -> Float:
     try:
-        return interpolated(*session.readings(channel), times_ns)
+        return interpolate(*session.readings(channel), times_ns)
     except SessionError:
         return np.full(len(times_ns), np.nan)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import FRAMES_DROPPED
-from thermostand.foundation.instants import duration
+from thermostand.foundation.instants import format_duration
 from thermostand.foundation.items import Event
 from thermostand.recording.format.utc_offsets import UtcOffsets
 
@@ -42,7 +42,7 @@ class Silence:
         """The silence as a sentence."""
         verb = "was" if len(self.names) == 1 else "were"
         span = f"from {utc.date_time(self.begin_ns)} to {utc.local_text(self.end_ns)}"
-        return f"{', '.join(self.names)} {verb} silent {span} ({duration(self.end_ns - self.begin_ns)})"
+        return f"{', '.join(self.names)} {verb} silent {span} ({format_duration(self.end_ns - self.begin_ns)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class _Hole:
     limit_ns: int
 
 
-def silences(times_ns: Mapping[str, NDArray[np.int64]]) -> list[Silence]:
+def find_silences(times_ns: Mapping[str, NDArray[np.int64]]) -> list[Silence]:
     """The silences in order of time; `times_ns` are the instants of each channel's readings, shape (n,), ascending."""
     recorded = {channel: times for channel, times in times_ns.items() if len(times) >= _RHYTHM}
     if not recorded:
@@ -65,22 +65,22 @@ def silences(times_ns: Mapping[str, NDArray[np.int64]]) -> list[Silence]:
     end_ns = max(int(times[-1]) for times in recorded.values())
     channels_of: dict[str, frozenset[str]] = {}
     for channel in recorded:
-        channels_of[_device(channel)] = channels_of.get(_device(channel), frozenset()) | {channel}
+        channels_of[_get_device(channel)] = channels_of.get(_get_device(channel), frozenset()) | {channel}
     together: list[list[_Hole]] = []
-    for hole in _holes(recorded, begin_ns, end_ns):
-        group = next((group for group in reversed(together) if _is_same(group[0], hole)), None)
+    for hole in _find_holes(recorded, begin_ns, end_ns):
+        group = next((group for group in reversed(together) if _is_same_gap(group[0], hole)), None)
         if group is None:
             together.append([hole])
         else:
             group.append(hole)
-    return [_silence(group, channels_of) for group in together]
+    return [_make_silence(group, channels_of) for group in together]
 
 
-def _device(channel: str) -> str:
+def _get_device(channel: str) -> str:
     return channel.partition(".")[0]
 
 
-def _holes(recorded: Mapping[str, NDArray[np.int64]], begin_ns: int, end_ns: int) -> list[_Hole]:
+def _find_holes(recorded: Mapping[str, NDArray[np.int64]], begin_ns: int, end_ns: int) -> list[_Hole]:
     """The holes of every channel, those of a device that are the same as one, in order of time."""
     found: dict[tuple[str, int, int], _Hole] = {}
     for channel, times_ns in recorded.items():
@@ -88,13 +88,13 @@ def _holes(recorded: Mapping[str, NDArray[np.int64]], begin_ns: int, end_ns: int
         limit_ns = max(round(MEDIANS * float(np.median(spacings_ns))), SHORTEST_NS)
         edges_ns = np.concatenate(([begin_ns], times_ns, [end_ns]))
         for index in np.flatnonzero(np.diff(edges_ns) > limit_ns):
-            key = _device(channel), int(edges_ns[index]), int(edges_ns[index + 1])
+            key = _get_device(channel), int(edges_ns[index]), int(edges_ns[index + 1])
             known = found.get(key, _Hole(*key[:1], frozenset(), *key[1:], limit_ns))
             found[key] = replace(known, channels=known.channels | {channel})
     return sorted(found.values(), key=lambda hole: (hole.begin_ns, hole.end_ns, hole.device))
 
 
-def _is_same(one: _Hole, other: _Hole) -> bool:
+def _is_same_gap(one: _Hole, other: _Hole) -> bool:
     """Two devices stopped and came back together, within their spacing."""
     tolerance_ns = max(one.limit_ns, other.limit_ns)
     return (
@@ -104,39 +104,39 @@ def _is_same(one: _Hole, other: _Hole) -> bool:
     )
 
 
-def _silence(group: Sequence[_Hole], channels_of: Mapping[str, frozenset[str]]) -> Silence:
+def _make_silence(group: Sequence[_Hole], channels_of: Mapping[str, frozenset[str]]) -> Silence:
     """The time all of the group were silent."""
     is_all = all(hole.channels == channels_of[hole.device] for hole in group)
     if is_all and len(channels_of) > 1 and {hole.device for hole in group} == set(channels_of):
         names: tuple[str, ...] = ("everything",)
     else:
-        names = tuple(name for hole in group for name in _names(hole, channels_of[hole.device]))
+        names = tuple(name for hole in group for name in _list_names(hole, channels_of[hole.device]))
     return Silence(names, max(hole.begin_ns for hole in group), min(hole.end_ns for hole in group))
 
 
-def _names(hole: _Hole, channels: frozenset[str]) -> list[str]:
+def _list_names(hole: _Hole, channels: frozenset[str]) -> list[str]:
     return [hole.device] if hole.channels == channels else sorted(hole.channels)
 
 
-def lost_frames_of(step_id: str, events: Iterable[Event]) -> int:
+def count_lost_frames(step_id: str, events: Iterable[Event]) -> int:
     """How many frames the recorder itself said it lost in events that name this step, or none."""
     of_it: list[Event] = []
     for event in events:
         steps = event.data.get("steps") if event.kind == FRAMES_DROPPED else []
         if steps is None or (isinstance(steps, list) and step_id in steps):
             of_it.append(event)
-    return sum(map(len, reported_blocks(of_it)))
+    return sum(map(len, list_reported_blocks(of_it)))
 
 
-def reported_blocks(events: Iterable[Event]) -> list[range]:
+def list_reported_blocks(events: Iterable[Event]) -> list[range]:
     """The block ids of frames that the recorder itself said it lost: `blocks` of the events' data, pairs of the first
     and the last. What is no such pair is left out: a session may be from anybody."""
     reported = [event.data.get("blocks") for event in events if event.kind == FRAMES_DROPPED]
     pairs = [pair for blocks in reported if isinstance(blocks, list) for pair in cast("list[object]", blocks)]
-    return [range(first, last + 1) for first, last in map(_pair, pairs) if 0 <= first <= last <= _LAST_BLOCK]
+    return [range(first, last + 1) for first, last in map(_parse_pair, pairs) if 0 <= first <= last <= _LAST_BLOCK]
 
 
-def _pair(found: object) -> tuple[int, int]:
+def _parse_pair(found: object) -> tuple[int, int]:
     """Two whole numbers; (0, -1) when it is something else."""
     match found:
         case [int(first), int(last)]:

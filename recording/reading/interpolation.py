@@ -15,7 +15,7 @@ GAP_NS = 120 * NS_PER_S
 """Readings further apart than this say nothing of the time between them."""
 
 
-def interpolated(times_ns: Instants, values: Float, at_ns: Instants, beyond_ns: int = 0) -> Float:
+def interpolate(times_ns: Instants, values: Float, at_ns: Instants, beyond_ns: int = 0) -> Float:
     """The values (n,) of ascending instants at the instants `at_ns` (m,): shape (m,).
 
     NaN across gaps, their ends included, and more than `beyond_ns` before the first and behind the last, up to which

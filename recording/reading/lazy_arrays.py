@@ -25,13 +25,13 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.format.decoded_items import frame_of, recorded_image
+from thermostand.recording.format.decoded_items import decode_frame, read_recorded_image
 from thermostand.recording.format.images import ImageArray
 from thermostand.recording.format.records import FramePlace
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.columns import ChannelColumn
 from thermostand.recording.reading.frames_table import FramesTable
-from thermostand.recording.reading.interpolation import interpolated
+from thermostand.recording.reading.interpolation import interpolate
 from thermostand.recording.reading.recorded_devices import recorded_devices
 
 
@@ -180,7 +180,7 @@ class SessionArrays(Mapping[str, Dataset]):
     def _interpolated(self, channel: str, times_ns: NDArray[np.int64]) -> NDArray[Any]:
         if channel not in self._session.units():  # declared, and never read
             return np.full(len(times_ns), np.nan)
-        return interpolated(*self._session.readings(channel), times_ns)
+        return interpolate(*self._session.readings(channel), times_ns)
 
 
 class _Later(BackendArray):
@@ -219,4 +219,4 @@ class _Images:
 
 
 def _image(place: FramePlace) -> ImageArray:
-    return frame_of(recorded_image(place)).image
+    return decode_frame(read_recorded_image(place)).image

@@ -18,8 +18,14 @@ from pathlib import Path
 from typing import cast
 
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.json_values import json_object
-from thermostand.recording.format.journal_lines import damage_text, journal_lines, lines_of, mark_of, unended_text
+from thermostand.foundation.json_values import parse_json_object
+from thermostand.recording.format.journal_lines import (
+    format_damage,
+    format_lines,
+    format_unended,
+    make_mark,
+    parse_lines,
+)
 
 NOTES_NAME = "notes.jsonl"
 LONGEST_NOTE = 4000  # characters
@@ -76,10 +82,10 @@ def read_notes(directory: Path) -> SessionNotes:
         return SessionNotes()
     finally:
         os.close(fd)
-    lines = lines_of(data)
-    found = _folded(entry for line in lines.sound if (entry := json_object(line)) is not None)
-    damage = damage_text(lines) if lines.damaged else ""
-    return replace(found, damage=damage, unended=unended_text(lines.unended_bytes) if lines.unended_bytes else "")
+    lines = parse_lines(data)
+    found = _fold(entry for line in lines.sound if (entry := parse_json_object(line)) is not None)
+    damage = format_damage(lines) if lines.damaged else ""
+    return replace(found, damage=damage, unended=format_unended(lines.unended_bytes) if lines.unended_bytes else "")
 
 
 def add_note(directory: Path, text: str, by: str, time_ns: int) -> None:
@@ -129,10 +135,10 @@ def _append(directory: Path, fields: Mapping[str, object]) -> None:
             status = os.fstat(fd)
             if not stat.S_ISREG(status.st_mode) or status.st_size + len(text) + _HEAD_BYTES > LIMIT_BYTES:
                 raise SessionError(f"{path}: is no file of notes, or is full")
-            lines, end = lines_of(os.pread(fd, LIMIT_BYTES, 0)), status.st_size
+            lines, end = parse_lines(os.pread(fd, LIMIT_BYTES, 0)), status.st_size
             end -= lines.unended_bytes
             os.ftruncate(fd, end)
-            _write_whole(fd, journal_lines((text,), lines.mark or mark_of(directory.absolute().name), end), end)
+            _write_whole(fd, format_lines((text,), lines.mark or make_mark(directory.absolute().name), end), end)
             os.fsync(fd)
             os.fsync(folder)  # the file may be new
     except OSError as error:
@@ -151,7 +157,7 @@ def _write_whole(fd: int, data: bytes, size_bytes: int) -> None:
         raise
 
 
-def _folded(entries: Iterable[dict[str, object]]) -> SessionNotes:
+def _fold(entries: Iterable[dict[str, object]]) -> SessionNotes:
     notes: list[Note] = []
     tags: dict[str, None] = {}
     archived: list[Archived] = []
@@ -163,9 +169,9 @@ def _folded(entries: Iterable[dict[str, object]]) -> SessionNotes:
             case "note":
                 notes.append(Note(time_ns, by, str(entry.get("text", ""))))
             case "tags":
-                tags |= dict.fromkeys(_tags(entry))
+                tags |= dict.fromkeys(_parse_tags(entry))
             case "untag":
-                tags = {tag: None for tag in tags if tag not in set(_tags(entry))}
+                tags = {tag: None for tag in tags if tag not in set(_parse_tags(entry))}
             case "archived":
                 archived.append(Archived(str(entry.get("to", "")), time_ns, str(entry.get("contents", ""))))
             case _:
@@ -173,7 +179,7 @@ def _folded(entries: Iterable[dict[str, object]]) -> SessionNotes:
     return SessionNotes(tuple(notes), tuple(tags), tuple(archived))
 
 
-def _tags(entry: dict[str, object]) -> list[str]:
+def _parse_tags(entry: dict[str, object]) -> list[str]:
     found = entry.get("tags")
     texts = cast("list[object]", found) if isinstance(found, list) else []
     return [tag for tag in texts if isinstance(tag, str) and TAG.fullmatch(tag)]

@@ -14,7 +14,7 @@ import numpy as np
 from thermostand.foundation.events import RUN_END, TELL_PLAN
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.recording.format.layout import FRAMES
-from thermostand.recording.reading.gaps import Silence, reported_blocks, silences
+from thermostand.recording.reading.gaps import Silence, find_silences, list_reported_blocks
 from thermostand.recording.reading.scan import ChannelReadings, Depth, Recorded, Scan, scan
 
 
@@ -85,22 +85,22 @@ class Overview:
         return next((event for event in reversed(self.events) if event.kind == RUN_END), None)
 
 
-def overview(path: Path) -> Overview:
+def summarise_session(path: Path) -> Overview:
     """The session in `path`, all its telemetry read; SessionError when there is none."""
     found = scan(path, Depth.TELEMETRY)
     recorded = found.recorded
     times_ns = {name: channel.sorted_times_ns() for name, channel in recorded.channels.items()}
     return Overview(
         found,
-        tuple(_steps(recorded)),
-        _frames(found),
+        tuple(_list_steps(recorded)),
+        _summarise_frames(found),
         tuple(_range(name, channel) for name, channel in sorted(recorded.channels.items())),
-        tuple(silences(times_ns)),
+        tuple(find_silences(times_ns)),
         tuple(sorted(recorded.events, key=lambda event: event.time_ns)),
     )
 
 
-def _steps(recorded: Recorded) -> Iterator[RunStep]:
+def _list_steps(recorded: Recorded) -> Iterator[RunStep]:
     """The steps in order of their index; of one that was begun again the last time counts."""
     by_camera = Counter((meta.step_id, meta.channel) for meta in recorded.metas)
     frames = Counter[str]()
@@ -126,7 +126,7 @@ def _steps(recorded: Recorded) -> Iterator[RunStep]:
         )
 
 
-def _frames(found: Scan) -> FramesSummary:
+def _summarise_frames(found: Scan) -> FramesSummary:
     size_bytes = sum(file.size_bytes for file in found.inventory if file.series == FRAMES)
     recorded = found.recorded
     metas = recorded.metas
@@ -138,7 +138,7 @@ def _frames(found: Scan) -> FramesSummary:
         first_ns=min(times_ns, default=None),
         last_ns=max(times_ns, default=None),
         dropped=sum(meta.dropped for meta in metas),
-        lost_by_recorder=sum(map(len, reported_blocks(recorded.events))),
+        lost_by_recorder=sum(map(len, list_reported_blocks(recorded.events))),
         flagged=Counter(flag for meta in metas for flag in meta.flags),
     )
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mcap.records import Channel
 
-from thermostand.recording.format.batches import READINGS, RecordedDevice, form_of
-from thermostand.recording.format.damage import reading
+from thermostand.recording.format.batches import READINGS, RecordedDevice, parse_batch_schema
+from thermostand.recording.format.damage import convert_damage
 from thermostand.recording.format.summary import read_summary
 
 
@@ -19,7 +19,7 @@ def recorded_devices(telemetry: Iterable[Path]) -> dict[str, RecordedDevice]:
     found: dict[str, RecordedDevice] = {}
     for channel in recorded_channels(telemetry):
         if channel.topic.startswith(READINGS):
-            form = form_of(channel.metadata)
+            form = parse_batch_schema(channel.metadata)
             before = found[form.name].channels if form.name in found else ()
             known = [(each.name, each.unit) for each in before]
             added = (each for each in form.device.channels if (each.name, each.unit) not in known)
@@ -31,7 +31,7 @@ def recorded_channels(telemetry: Iterable[Path]) -> list[Channel]:
     """The MCAP channels of each of these segments, from its index; SessionError when it cannot be read."""
     channels: list[Channel] = []
     for path in telemetry:
-        with reading(path), path.open("rb") as file:
+        with convert_damage(path), path.open("rb") as file:
             numbered = read_summary(file, path.stat().st_size).channels()
         channels += [numbered[number][0] for number in sorted(numbered)]
     return channels

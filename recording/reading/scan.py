@@ -37,20 +37,21 @@ from thermostand.foundation.events import FRAMES_DROPPED, RUN_BEGINS, RUN_END, T
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import READINGS, name_apart
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.format.damage import DAMAGE
-from thermostand.recording.format.holes import Hole, holes_in, segments_text
-from thermostand.recording.format.images import frame_topics
+from thermostand.recording.format.holes import Hole, format_segments, parse_holes
+from thermostand.recording.format.images import name_frame_topics
 from thermostand.recording.format.inventory import (
     MOST_MISSING,
     SegmentFile,
     SegmentState,
-    foreign_numbers,
-    inventory,
-    misplaced,
-    missing_numbers,
-    strays,
+    find_foreign_numbers,
+    find_missing_numbers,
+    is_misplaced,
+    list_segments,
+    list_strays,
 )
-from thermostand.recording.format.journal_lines import JOURNAL_NAME, JournalFacts, journal_facts, text_hash
+from thermostand.recording.format.journal_lines import JOURNAL_NAME, JournalFacts, hash_text, read_journal_facts
 from thermostand.recording.format.layout import (
     FINISHED,
     FRAMES,
@@ -58,19 +59,24 @@ from thermostand.recording.format.layout import (
     SEGMENT_METADATA,
     SESSION_METADATA,
     TELEMETRY,
-    unknown_format,
+    explain_unknown_format,
 )
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, NoManifest, SessionInfo, read_manifest
 from thermostand.recording.format.mcap_bytes import Source
 from thermostand.recording.format.messages import FrameMeta, decode_frame_meta
-from thermostand.recording.format.records import RecordedMessage, frame_places, read_head, telemetry_messages
-from thermostand.recording.format.restarts import begins_of, is_superseded
-from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, offsets_of
-from thermostand.recording.reading.gaps import lost_frames_of, reported_blocks, silences
+from thermostand.recording.format.records import RecordedMessage, list_frame_places, read_head, read_telemetry_messages
+from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, collect_offsets
+from thermostand.recording.reading.gaps import count_lost_frames, find_silences, list_reported_blocks
 from thermostand.recording.reading.notes import NOTES_NAME, read_notes
-from thermostand.recording.reading.run_word import Files, RunOutcome, extent_of, last_run_event, run_word
+from thermostand.recording.reading.run_status import (
+    Files,
+    RunOutcome,
+    determine_run_outcome,
+    find_last_run_event,
+    parse_extent,
+)
 from thermostand.recording.reading.segment_check import SegmentDamage, check_segment
-from thermostand.recording.reading.walk import survey
+from thermostand.recording.reading.segment_scan import scan_segment
 
 Report = Callable[[float, str], None]
 NO_TEMPERATURE = "no frame has a good camera temperature"
@@ -160,7 +166,7 @@ class Recorded:
 
 
 @dataclass
-class SegmentSeen:
+class ScannedSegment:
     """A finished segment, as far as it was read: its records, its texts, how many messages it has and between which
     instants. sha256: of its bytes, "" when not all were read. damages: what is wrong with it."""
 
@@ -264,12 +270,12 @@ def verify(path: Path, report: Report = _no_report) -> Scan:
 def scan(path: Path, depth: Depth = Depth.ENDS, report: Report = _no_report) -> Scan:
     """The session in `path`, as far as `depth` says; as `verify`. Where its ends show fewer frames than its plan, and
     nothing that explains it, its steps are read as well."""
-    files = inventory(path)
+    files = list_segments(path)
     if not files:
         raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
-    look = _Look(path, files, depth)
+    look = _SessionScanner(path, files, depth)
     look.read(report)
-    found = look.result()
+    found = look.build_result()
     is_quiet = found.is_sound and not any(file.state is SegmentState.RECORDING for file in files)
     if depth is Depth.ENDS and is_quiet and (found.run is not RunOutcome.COMPLETE or look.frames_short()):
         deeper = scan(path, Depth.STEPS, report)
@@ -285,14 +291,14 @@ def _is_near(channel: Channel) -> bool:
     return channel.topic in (messages.EVENT, messages.STEP)
 
 
-class _Look:
+class _SessionScanner:
     """One look at a session: what was read of it, and then what that means."""
 
     def __init__(self, path: Path, files: tuple[SegmentFile, ...], depth: Depth) -> None:
         self._path = path
         self._files = files
         self._depth = depth
-        self._seen: list[SegmentSeen] = []
+        self._seen: list[ScannedSegment] = []
         self._recorded = Recorded()
         self._read_bytes = 0
 
@@ -301,7 +307,9 @@ class _Look:
     def read(self, report: Report) -> None:
         for file in self._files:
             if file.state is SegmentState.FINISHED:
-                self._seen.append(self._every_byte(file, report) if self._depth is Depth.BYTES else self._ends(file))
+                self._seen.append(
+                    self._read_every_byte(file, report) if self._depth is Depth.BYTES else self._read_ends(file)
+                )
         if self._depth is Depth.BYTES:
             return
         sound = [each for each in self._seen if not each.damages]
@@ -309,12 +317,12 @@ class _Look:
         if self._depth is not Depth.ENDS:
             for each in sound:
                 if each.file.series == FRAMES:
-                    with self._damaging(each):
-                        self._recorded.metas.extend(place.meta for place in frame_places(each.file.path))
+                    with self._catch_damage(each):
+                        self._recorded.metas.extend(place.meta for place in list_frame_places(each.file.path))
 
-    def _ends(self, file: SegmentFile) -> SegmentSeen:
-        seen = SegmentSeen(file)
-        with self._damaging(seen):
+    def _read_ends(self, file: SegmentFile) -> ScannedSegment:
+        seen = ScannedSegment(file)
+        with self._catch_damage(seen):
             head = read_head(file.path)
             seen.session, seen.place, seen.salvage, seen.texts = (
                 head.session,
@@ -327,21 +335,21 @@ class _Look:
                 seen.first_ns, seen.last_ns = span.first_ns, span.last_ns
         return seen
 
-    def _damaging(self, seen: SegmentSeen) -> _Damaging:
-        return _Damaging(self._path, seen)
+    def _catch_damage(self, seen: ScannedSegment) -> _DamageCatcher:
+        return _DamageCatcher(self._path, seen)
 
-    def _read_telemetry(self, telemetry: Sequence[SegmentSeen]) -> None:
+    def _read_telemetry(self, telemetry: Sequence[ScannedSegment]) -> None:
         """All of it, or (ENDS) what the first segment and those of the last minutes say of the run and of UTC."""
         last_ns = max((each.last_ns for each in telemetry), default=0) - REPEATED_NS - NS_PER_S
         is_all, wants_all = self._depth is not Depth.ENDS, self._depth is Depth.TELEMETRY
         for index, each in enumerate(telemetry):
             if is_all or not index or each.last_ns >= last_ns or index >= len(telemetry) - _LAST:
-                unseen = SegmentSeen(each.file)  # a list does not report what it only met by the way
-                with self._damaging(each if is_all else unseen):
-                    for message in telemetry_messages(each.file.path, _is_wanted if wants_all else _is_near):
+                unseen = ScannedSegment(each.file)  # a list does not report what it only met by the way
+                with self._catch_damage(each if is_all else unseen):
+                    for message in read_telemetry_messages(each.file.path, _is_wanted if wants_all else _is_near):
                         self._recorded.receive(message)
 
-    def _every_byte(self, file: SegmentFile, report: Report) -> SegmentSeen:
+    def _read_every_byte(self, file: SegmentFile, report: Report) -> ScannedSegment:
         unreadable: list[SegmentDamage] = []
 
         def receive(message: RecordedMessage) -> None:
@@ -360,7 +368,7 @@ class _Look:
                 unreadable.append(SegmentDamage(str(error), -inf, inf))
         strange = [name for name, text in check.texts.items() if not _is_utf_8(text)]
         unreadable += [SegmentDamage(f"{name}, which is attached, is not UTF-8") for name in strange]
-        return SegmentSeen(
+        return ScannedSegment(
             file,
             session=check.metadata.get(SESSION_METADATA, {}),
             place=check.metadata.get(SEGMENT_METADATA, {}),
@@ -375,20 +383,20 @@ class _Look:
 
     # Judging
 
-    def result(self) -> Scan:
+    def build_result(self) -> Scan:
         described = [each for each in self._seen if each.session]
-        self._metadata, self._texts = self._opening(described)
-        self._extent = extent_of(self._metadata)
-        self._journal = journal_facts(self._path)
+        self._metadata, self._texts = self._find_opening(described)
+        self._extent = parse_extent(self._metadata)
+        self._journal = read_journal_facts(self._path)
         self._manifest = read_manifest(self._path)
-        self._utc = offsets_of(self._recorded.events)
+        self._utc = collect_offsets(self._recorded.events)
         self._is_recording = any(file.state is SegmentState.RECORDING for file in self._files)
         self._lost_end = None if self._extent else self._find_lost_end()
         with_messages = [each for each in self._seen if each.messages]
         run = (
             self._extent.run
             if self._extent
-            else run_word(self._recorded.events, self._journal, is_recording=self._is_recording)
+            else determine_run_outcome(self._recorded.events, self._journal, is_recording=self._is_recording)
         )
         self._run = run
         return Scan(
@@ -399,28 +407,28 @@ class _Look:
             attachments=dict(self._texts),
             segments=len(self._seen),
             messages=sum(each.messages for each in self._seen),
-            frames=self._frame_count(),
+            frames=self._count_frames(),
             bytes=self._read_bytes,
             begin_ns=min((int(each.first_ns) for each in with_messages), default=None),
             end_ns=max((int(each.last_ns) for each in with_messages), default=None),
-            findings=tuple(dict.fromkeys(self._findings())),
-            holes=self._holes(),
+            findings=tuple(dict.fromkeys(self._iterate_findings())),
+            holes=self._collect_holes(),
             utc=self._utc,
             run=run,
             has_camera_degC=self._has_camera_degC(),
-            planned=self._planned(),
+            planned=self._find_planned_count(),
             recorded=self._recorded,
         )
 
-    def _frame_count(self) -> int:
+    def _count_frames(self) -> int:
         if self._depth is Depth.BYTES:
             return len(self._recorded.metas)
-        return sum(each.messages // 2 for each in self._of(FRAMES))
+        return sum(each.messages // 2 for each in self._select_series(FRAMES))
 
-    def _of(self, series: str) -> list[SegmentSeen]:
+    def _select_series(self, series: str) -> list[ScannedSegment]:
         return [each for each in self._seen if each.file.series == series]
 
-    def _opening(self, described: Sequence[SegmentSeen]) -> tuple[Mapping[str, str], Mapping[str, str]]:
+    def _find_opening(self, described: Sequence[ScannedSegment]) -> tuple[Mapping[str, str], Mapping[str, str]]:
         """Metadata `session` and the attachments: those that most finished segments have, else those of the first other
         segment that has them; empty when none has."""
         if described:
@@ -430,117 +438,121 @@ class _Look:
             return own.session, dict(texts.most_common(1)[0][0]) if texts else own.texts
         for file in self._files:
             with suppress(OSError), file.path.open("rb") as opened:
-                found = survey(Source(opened.fileno()), to_first_chunk=True)
+                found = scan_segment(Source(opened.fileno()), to_first_chunk=True)
                 if found.session is not None:
                     texts = {name: each.data.decode(errors="replace") for name, each in found.attachments.items()}
                     return found.session, texts
         return {}, {}
 
-    def _findings(self) -> Iterator[SessionFinding]:
-        yield from _format(self._metadata)
+    def _iterate_findings(self) -> Iterator[SessionFinding]:
+        yield from _check_format(self._metadata)
         if self._extent is not None:
-            yield _note(self._extent.text(self._utc))
-        yield from self._not_finished()
-        for name in strays(self._path):
-            yield _note("is no segment by its name, or no file; it counts for nothing", name)
-        yield from self._missing()
+            yield _make_note(self._extent.text(self._utc))
+        yield from self._find_unfinished()
+        for name in list_strays(self._path):
+            yield _make_note("is no segment by its name, or no file; it counts for nothing", name)
+        yield from self._find_missing()
         for each in self._seen:
             for damage in each.damages:
-                yield _error(f"is damaged: {damage.text}", each.file.name)
-        yield from self._misfits()
-        yield from self._changed_texts()
-        yield from self._manifest_findings()
+                yield _make_error(f"is damaged: {damage.text}", each.file.name)
+        yield from self._find_misfits()
+        yield from self._find_changed_texts()
+        yield from self._compare_manifest()
         if self._extent is None:
-            yield from self._journal_and_end()
-        yield from _of_notes(self._path)
+            yield from self._check_journal_and_end()
+        yield from _check_notes(self._path)
         if self._depth is not Depth.ENDS and self._extent is None:
-            yield from self._steps_without_frames()
-        yield from self._silent_devices()
+            yield from self._find_steps_without_frames()
+        yield from self._find_silent_devices()
         if self._depth is Depth.BYTES:
-            yield from _frames_lost(self._recorded, self._utc)
+            yield from _find_lost_frames(self._recorded, self._utc)
             times_ns = {name: channel.sorted_times_ns() for name, channel in self._recorded.channels.items()}
-            for silence in silences(times_ns):
-                yield _note(silence.text(self._utc))
+            for silence in find_silences(times_ns):
+                yield _make_note(silence.text(self._utc))
             if self._has_camera_degC() is False:
-                yield _note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
+                yield _make_note(f"{NO_TEMPERATURE}: no drift over temperature can be fitted to them")
 
-    def _not_finished(self) -> Iterator[SessionFinding]:
+    def _find_unfinished(self) -> Iterator[SessionFinding]:
         by_name = {each.file.name: each for each in self._seen}
         for file in self._files:
             match file.state:
                 case SegmentState.UNFINISHED:
-                    yield _missing_part("is not finished; `stand session repair` recovers what is in it", file.name)
+                    yield _make_missing("is not finished; `stand session repair` recovers what is in it", file.name)
                 case SegmentState.DAMAGED if _is_recovered(
                     file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")
                 ):
-                    yield _note(
+                    yield _make_note(
                         "a repair recovered every message and kept the original because it was finished and damaged; "
                         "remove it when it is not needed",
                         file.name,
                     )
                 case SegmentState.DAMAGED:
-                    yield _error("is an original that a repair kept because it could not recover all of it", file.name)
+                    yield _make_error(
+                        "is an original that a repair kept because it could not recover all of it", file.name
+                    )
                 case SegmentState.RECORDING:
-                    yield _note("is being recorded now and was not read", file.name)
+                    yield _make_note("is being recorded now and was not read", file.name)
                 case SegmentState.FINISHED:
                     pass
 
-    def _missing(self) -> Iterator[SessionFinding]:
+    def _find_missing(self) -> Iterator[SessionFinding]:
         """Segments are numbered from 0 without a gap; a copy of a session with gaps has them in its record."""
         for series in (TELEMETRY, FRAMES):
             numbers = {file.number for file in self._files if file.series == series}
-            for number in sorted(foreign_numbers(numbers)):
-                yield _error(
+            for number in sorted(find_foreign_numbers(numbers)):
+                yield _make_error(
                     f"is foreign: no segment of this session has a number beyond {MOST_MISSING} missing ones",
                     f"{series}/{number:04d}.mcap",
                 )
-            for hole in self._gaps(series):
+            for hole in self._list_gaps(series):
                 text = "is missing"
                 if hole.first != hole.last:
-                    when = hole.when(self._utc)
+                    when = hole.format_time(self._utc)
                     text += f", and so are all up to {hole.last:04d}.mcap{f', {when}' if when else ''}"
-                yield _missing_part(text, f"{series}/{hole.first or 0:04d}.mcap")
+                yield _make_missing(text, f"{series}/{hole.first or 0:04d}.mcap")
             if not any(file.series == TELEMETRY for file in self._files) and series == TELEMETRY:
-                yield _missing_part("is missing", TELEMETRY)
+                yield _make_missing("is missing", TELEMETRY)
         for hole in self._recorded_holes:
-            found = _note if hole.excused else _missing_part
+            found = _make_note if hole.excused else _make_missing
             yield found(f"missing in the session this was copied from: {hole.text(self._utc)}")
 
     @property
     def _recorded_holes(self) -> tuple[Hole, ...]:
-        return holes_in(self._metadata.get("holes", ""))
+        return parse_holes(self._metadata.get("holes", ""))
 
-    def _gaps(self, series: str) -> list[Hole]:
+    def _list_gaps(self, series: str) -> list[Hole]:
         """The ranges of segments that are not there, with the instants around them."""
-        read = sorted((each for each in self._of(series) if each.messages), key=lambda each: each.file.number)
+        read = sorted(
+            (each for each in self._select_series(series) if each.messages), key=lambda each: each.file.number
+        )
         found: list[Hole] = []
-        for first, last in missing_numbers(file.number for file in self._files if file.series == series):
+        for first, last in find_missing_numbers(file.number for file in self._files if file.series == series):
             before = [each.last_ns for each in read if each.file.number < first]
             after = [each.first_ns for each in read if each.file.number > last]
             begin_ns, end_ns = int(max(before)) if before else None, int(min(after)) if after else None
             found.append(Hole(series, first, last, begin_ns, end_ns))
         return found
 
-    def _misfits(self) -> Iterator[SessionFinding]:
+    def _find_misfits(self) -> Iterator[SessionFinding]:
         """Every segment names the same session, and its own place in it."""
         for each in self._seen:
             file = each.file
             if not each.is_described and each.damages:
                 continue  # a finding already
             if dict(each.session) != dict(self._metadata):
-                yield _error("belongs to another session than the other segments", file.name)
-            if misplaced(file.series, file.number, each.place, each.session):
-                yield _error("records another place in the session than its name", file.name)
+                yield _make_error("belongs to another session than the other segments", file.name)
+            if is_misplaced(file.series, file.number, each.place, each.session):
+                yield _make_error("records another place in the session than its name", file.name)
             if each.salvage:
                 said = ", ".join(f"{key}: {text}" for key, text in each.salvage.items())
-                yield _note(f"was repaired ({said})", file.name)
+                yield _make_note(f"was repaired ({said})", file.name)
 
-    def _changed_texts(self) -> Iterator[SessionFinding]:
+    def _find_changed_texts(self) -> Iterator[SessionFinding]:
         """Every segment has the same texts attached, and they are those that the recording began with."""
         sound = [each for each in self._seen if not each.damages and dict(each.session) == dict(self._metadata)]
         for each in sound:
             if dict(each.texts) != dict(self._texts):
-                yield _error("has other texts attached than the other segments", each.file.name)
+                yield _make_error("has other texts attached than the other segments", each.file.name)
         if not sound:
             return
         told: set[str] = set()
@@ -548,39 +560,41 @@ class _Look:
         stated[MANIFEST_NAME] = self._manifest.texts if isinstance(self._manifest, Manifest) else None
         for where, texts in stated.items():
             for name, known in (texts or {}).items():
-                if name not in told and text_hash(self._texts.get(name)) != known:
+                if name not in told and hash_text(self._texts.get(name)) != known:
                     told.add(name)
-                    yield _error(f"{name} is not attached as the run began with it, by {where}")
+                    yield _make_error(f"{name} is not attached as the run began with it, by {where}")
         listed = stated[MANIFEST_NAME]
         for name in sorted(self._texts.keys() - (self._texts if listed is None else listed).keys()):
-            yield _error(f"{name} is attached, and was not when the run began, by {MANIFEST_NAME}")
+            yield _make_error(f"{name} is attached, and was not when the run began, by {MANIFEST_NAME}")
 
-    def _manifest_findings(self) -> Iterator[SessionFinding]:
+    def _compare_manifest(self) -> Iterator[SessionFinding]:
         """What the recorder stated, against what is there."""
         stated = self._manifest
         if isinstance(stated, NoManifest):
             remake = "; `stand session repair` makes one of what is there"
             if stated.is_missing and not self._is_recording:
-                yield _missing_part(
+                yield _make_missing(
                     f"{stated.text}: whether all segments are there is not known{remake}", MANIFEST_NAME
                 )
             elif stated.is_newer:
                 yield SessionFinding(Severity.ERROR, MANIFEST_NAME, stated.text, Files.UNKNOWN)
             elif not stated.is_missing:
-                yield _error(f"{stated.text}{remake}", MANIFEST_NAME)
+                yield _make_error(f"{stated.text}{remake}", MANIFEST_NAME)
             return
         if stated.remade:
-            yield _note("was made by a repair of what was there; what was missing then is not known", MANIFEST_NAME)
+            yield _make_note(
+                "was made by a repair of what was there; what was missing then is not known", MANIFEST_NAME
+            )
         if self._metadata and dict(stated.session) != dict(self._metadata):
-            yield _error("is of another session than the segments", MANIFEST_NAME)
+            yield _make_error("is of another session than the segments", MANIFEST_NAME)
             return
         for each in self._seen:
-            if finding := self._listed(stated, each):
+            if finding := self._compare_listed(stated, each):
                 yield finding
         if self._extent is None and stated.journal is not None:
-            yield from _of_journal(self._path, stated, self._journal)
+            yield from _check_journal(self._path, stated, self._journal)
 
-    def _listed(self, stated: Manifest, each: SegmentSeen) -> SessionFinding | None:
+    def _compare_listed(self, stated: Manifest, each: ScannedSegment) -> SessionFinding | None:
         """What `session.json` has against a finished segment that is there."""
         name, known = each.file.name, stated.segments.get(each.file.name)
         if each.damages or dict(each.session) != dict(self._metadata):
@@ -591,69 +605,69 @@ class _Look:
             return None
         if each.salvage or (known is None and not stated.ended):
             why = "a repair" if each.salvage else "its recorder"
-            return _note(f"{why} did not come to list it in {MANIFEST_NAME}; `stand session repair` does", name)
+            return _make_note(f"{why} did not come to list it in {MANIFEST_NAME}; `stand session repair` does", name)
         if known is None:
-            return _error(f"is none of the segments that {MANIFEST_NAME} lists", name)
-        return _error(f"is not as it was recorded: {MANIFEST_NAME} lists another size or hash", name)
+            return _make_error(f"is none of the segments that {MANIFEST_NAME} lists", name)
+        return _make_error(f"is not as it was recorded: {MANIFEST_NAME} lists another size or hash", name)
 
-    def _unseen(self, series: str) -> list[int]:
+    def _find_unseen(self, series: str) -> list[int]:
         """The numbers of listed segments of which there is no file, behind the last one that there is."""
         if not isinstance(self._manifest, Manifest) or self._manifest.session != self._metadata:
             return []
         listed = [name.partition("/") for name in self._manifest.segments]
-        there = {file.number for file in self._files if file.series == series}
+        present = {file.number for file in self._files if file.series == series}
         numbers = {int(name.partition(".")[0]) for of, _, name in listed if of == series and name[:4].isdigit()}
-        return sorted(number for number in numbers if number > max(there, default=-1))
+        return sorted(number for number in numbers if number > max(present, default=-1))
 
-    def _journal_and_end(self) -> Iterator[SessionFinding]:
+    def _check_journal_and_end(self) -> Iterator[SessionFinding]:
         """The journal by itself, and what it says that is not in the recording, nor in what is damaged of it."""
         journal = self._journal
-        if journal is None and is_of_a_run(self._recorded.events, self._recorded.marks):
-            yield _missing_part("is missing; what the recording itself says of the run counts", JOURNAL_NAME)
+        if journal is None and has_run(self._recorded.events, self._recorded.marks):
+            yield _make_missing("is missing; what the recording itself says of the run counts", JOURNAL_NAME)
         if journal is not None and journal.damage:
-            yield _error(journal.damage, JOURNAL_NAME)
+            yield _make_error(journal.damage, JOURNAL_NAME)
         if journal is not None and journal.unended:
-            yield _note(journal.unended, JOURNAL_NAME)
+            yield _make_note(journal.unended, JOURNAL_NAME)
         if (lost := self._lost_end) is not None:
-            yield _missing_part(f"is missing, with all that followed: {lost.why}", lost.where)
-        unseen = self._unseen(FRAMES)
+            yield _make_missing(f"is missing, with all that followed: {lost.why}", lost.where)
+        unseen = self._find_unseen(FRAMES)
         if unseen:
             where = f"{FRAMES}/{unseen[0]:04d}.mcap"
-            yield _missing_part(f"is missing: {MANIFEST_NAME} lists {_segments(len(unseen))} more", where)
+            yield _make_missing(f"is missing: {MANIFEST_NAME} lists {_format_segments(len(unseen))} more", where)
 
     def _find_lost_end(self) -> _LostEnd | None:
         """Whether the end of the telemetry is missing; None while something of it is unread, or damaged."""
         series = [file for file in self._files if file.series == TELEMETRY]
-        seen = [each for each in self._of(TELEMETRY) if each.messages]
+        seen = [each for each in self._select_series(TELEMETRY) if each.messages]
         if not seen or self._is_recording or series[-1].state is SegmentState.UNFINISHED:
             return None
         if any(each.damages for each in self._seen if each.file == series[-1]):
             return None
         end_ns, last = int(max(each.last_ns for each in seen)), seen[-1]
-        has_gap = any(hole.series == TELEMETRY for hole in (*self._recorded_holes, *self._gaps(TELEMETRY)))
-        has_gap |= any(each.damages for each in self._of(TELEMETRY)) or any(
+        has_gap = any(hole.series == TELEMETRY for hole in (*self._recorded_holes, *self._list_gaps(TELEMETRY)))
+        has_gap |= any(each.damages for each in self._select_series(TELEMETRY)) or any(
             file.state is SegmentState.UNFINISHED for file in series
         )
         knows_steps = self._depth is not Depth.ENDS and not has_gap
         done = frozenset(mark.step_id for mark in self._recorded.marks if mark.state is StepState.DONE)
-        why = _why(
+        why = _explain_lost_end(
             end_ns,
             bool(last.salvage),
-            last_run_event(self._recorded.events),
+            find_last_run_event(self._recorded.events),
             done if knows_steps else frozenset(),
             self._journal,
             self._utc,
         )
-        if not why and (unseen := self._unseen(TELEMETRY)):
-            why = f"{MANIFEST_NAME} lists {_segments(len(unseen))} more"
+        if not why and (unseen := self._find_unseen(TELEMETRY)):
+            why = f"{MANIFEST_NAME} lists {_format_segments(len(unseen))} more"
         if not why:
             return None
         journal = self._journal
         to_ns = None if journal is None or journal.last_ns <= end_ns else journal.last_ns
         hole = Hole(TELEMETRY, series[-1].number + 1, None, end_ns, to_ns)
-        return _LostEnd(hole, why + frames_of_plan(self._planned(), self._frame_count()))
+        return _LostEnd(hole, why + format_planned_frames(self._find_planned_count(), self._count_frames()))
 
-    def _planned(self) -> int | None:
+    def _find_planned_count(self) -> int | None:
         """How many frames the plan has, by the events, else by the manifest; None when neither says."""
         planned = [event.data.get("frames") for event in self._recorded.events if event.kind in TELL_PLAN]
         last = planned[-1] if planned else None
@@ -663,7 +677,7 @@ class _Look:
 
     def frames_short(self) -> bool:
         """Whether there are fewer frames than planned."""
-        return bool(frames_of_plan(self._planned(), self._frame_count()))
+        return bool(format_planned_frames(self._find_planned_count(), self._count_frames()))
 
     def _all_frames_are_read(self) -> bool:
         """Whether no frame may be in a segment that was not read."""
@@ -679,60 +693,60 @@ class _Look:
             return []
         return find_shortages(self._recorded.marks, self._recorded.events, self._recorded.metas)
 
-    def _not_begun(self) -> int:
+    def _count_not_begun(self) -> int:
         """How many frames of the plan of a complete run are not there, of whatever step; 0 when an operator has left
         out one, or something else is missing that may have them."""
         is_over = self._run is RunOutcome.COMPLETE and (
-            (last := last_run_event(self._recorded.events)) is not None and last.kind == RUN_END
+            (last := find_last_run_event(self._recorded.events)) is not None and last.kind == RUN_END
         )
-        due, recorded = self._planned(), self._recorded
+        due, recorded = self._find_planned_count(), self._recorded
         if not is_over or due is None or any(mark.state is StepState.SKIPPED for mark in recorded.marks):
             return 0
         is_whole = self._all_frames_are_read() and not any(each.damages for each in self._seen)
-        is_whole &= not self._recorded_holes and not any(map(self._gaps, (TELEMETRY, FRAMES)))
+        is_whole &= not self._recorded_holes and not any(map(self._list_gaps, (TELEMETRY, FRAMES)))
         is_whole &= self._depth is not Depth.ENDS and self._extent is None and not self._shortages
         if not is_whole or self._lost_end is not None:
             return 0
         most: dict[str, int] = {}
         for (step_id, _), count in Counter((meta.step_id, meta.channel) for meta in recorded.metas).items():
             most[step_id] = max(most.get(step_id, 0), count)
-        return max(0, due - sum(most.values()) - sum(map(len, reported_blocks(recorded.events))))
+        return max(0, due - sum(most.values()) - sum(map(len, list_reported_blocks(recorded.events))))
 
-    def _steps_without_frames(self) -> Iterator[SessionFinding]:
+    def _find_steps_without_frames(self) -> Iterator[SessionFinding]:
         """Every step that is done has its frames; what was not read may have them."""
-        if missing := self._not_begun():
-            yield _missing_part(f"{_frames(missing)} of the plan: missing, though the run is complete")
-        is_damaged = any(each.damages for each in self._of(FRAMES))
+        if missing := self._count_not_begun():
+            yield _make_missing(f"{_format_frames(missing)} of the plan: missing, though the run is complete")
+        is_damaged = any(each.damages for each in self._select_series(FRAMES))
         for short in self._shortages:
             steps = short.step_ids[0] if len(short.step_ids) == 1 else f"{short.step_ids[0]} to {short.step_ids[-1]}"
             span = f"{self._utc.date_time(short.begin_ns)} to {self._utc.local_text(short.end_ns)}"
-            which = f"{_frames(short.missing)} of {steps}, {span}"
+            which = f"{_format_frames(short.missing)} of {steps}, {span}"
             if short.is_reported:
-                yield _note(f"{which}: lost by the recorder, as its events say")
+                yield _make_note(f"{which}: lost by the recorder, as its events say")
             elif not is_damaged:
-                yield _missing_part(f"{which}: missing, though their steps are done")
+                yield _make_missing(f"{which}: missing, though their steps are done")
 
-    def _holes(self) -> tuple[Hole, ...]:
+    def _collect_holes(self) -> tuple[Hole, ...]:
         """The holes of the telemetry, then of the frames."""
-        telemetry = self._gaps(TELEMETRY)
+        telemetry = self._list_gaps(TELEMETRY)
         if self._lost_end is not None:
             telemetry.append(replace(self._lost_end.hole, end_ns=None))
-        found = (*self._recorded_holes, *telemetry, *self._frames_holes())
-        missing = 0 if found else self._not_begun()
+        found = (*self._recorded_holes, *telemetry, *self._list_frame_holes())
+        missing = 0 if found else self._count_not_begun()
         return (Hole(FRAMES, None, None, None, None, missing),) if missing else found
 
-    def _frames_holes(self) -> Iterator[Hole]:
+    def _list_frame_holes(self) -> Iterator[Hole]:
         """The gaps with the number of frames that went with them, then what is missing without a missing number: behind
         the last segment, or in between."""
-        gaps, unseen = self._gaps(FRAMES), self._unseen(FRAMES)
-        read = [each for each in self._of(FRAMES) if each.messages]
+        gaps, unseen = self._list_gaps(FRAMES), self._find_unseen(FRAMES)
+        read = [each for each in self._select_series(FRAMES) if each.messages]
         last_ns = max((int(each.last_ns) for each in read), default=None)
-        number = max((each.file.number for each in self._of(FRAMES)), default=-1) + 1
+        number = max((each.file.number for each in self._select_series(FRAMES)), default=-1) + 1
         tail = Hole(FRAMES, number, None, last_ns, None)
         counts: Counter[Hole] = Counter()
         loose: list[Hole] = []
         for short in self._shortages:
-            gap = next((gap for gap in gaps if gap.within(short.begin_ns, short.end_ns + 1) is not None), None)
+            gap = next((gap for gap in gaps if gap.clip(short.begin_ns, short.end_ns + 1) is not None), None)
             if gap is None and tail.covers(short.begin_ns) and not short.is_reported:
                 gap = tail
             if gap is None:
@@ -746,37 +760,37 @@ class _Look:
     def _has_camera_degC(self) -> bool | None:
         """By the descriptions of the frames, as far as the first that has one; None without any description."""
         found = None
-        for meta in self._recorded.metas if self._depth is not Depth.ENDS else self._first_metas():
+        for meta in self._recorded.metas if self._depth is not Depth.ENDS else self._iterate_first_metas():
             if not math.isnan(meta.camera_degC):
                 return True
             found = False
         return found
 
-    def _first_metas(self) -> Iterator[FrameMeta]:
-        for each in self._of(FRAMES):
+    def _iterate_first_metas(self) -> Iterator[FrameMeta]:
+        for each in self._select_series(FRAMES):
             with suppress(SessionError):
-                yield from (place.meta for place in frame_places(each.file.path))
+                yield from (place.meta for place in list_frame_places(each.file.path))
 
-    def _silent_devices(self) -> Iterator[SessionFinding]:
+    def _find_silent_devices(self) -> Iterator[SessionFinding]:
         """Devices of which a complete run has no reading though they were declared; where the readings were read, also
         channels of others. A device that is opened by what uses it, as a camera in a run without frames, may have none.
         What may have been in a part that is damaged or missing is not looked for: that is a finding already."""
         stated = self._manifest
         if not isinstance(stated, Manifest) or self._run is not RunOutcome.COMPLETE or self._extent is not None:
             return
-        if self._gaps(TELEMETRY) or self._lost_end or any(each.damages for each in self._of(TELEMETRY)):
+        if self._list_gaps(TELEMETRY) or self._lost_end or any(each.damages for each in self._select_series(TELEMETRY)):
             return
         topics = {topic for each in stated.segments.values() for topic, count in each.messages.items() if count}
         for name, declared in sorted(stated.devices.items()):
             if f"{READINGS}{name}" not in topics:
-                is_due = declared.get("is_opened", True) or frame_topics(f"{name}.image").image in topics
-                found = _missing_part if is_due else _note
+                is_due = declared.get("is_opened", True) or name_frame_topics(f"{name}.image").image in topics
+                found = _make_missing if is_due else _make_note
                 yield found(f"{name}: no reading of this device is recorded, though it was declared")
                 continue
             channels = declared.get("channels", {})
             known = channels if isinstance(channels, dict) and self._depth >= Depth.TELEMETRY else ()
             if silent := [channel for channel in known if channel not in self._recorded.channels]:
-                yield _missing_part(f"{', '.join(silent)}: no reading of this is recorded, though it was declared")
+                yield _make_missing(f"{', '.join(silent)}: no reading of this is recorded, though it was declared")
 
 
 def _is_utf_8(text: str) -> bool:
@@ -788,10 +802,10 @@ def _is_utf_8(text: str) -> bool:
     return True
 
 
-class _Damaging:
+class _DamageCatcher:
     """What cannot be read inside becomes a damage of the segment."""
 
-    def __init__(self, path: Path, seen: SegmentSeen) -> None:
+    def __init__(self, path: Path, seen: ScannedSegment) -> None:
         self._prefix = f"{seen.file.path}: "
         self._seen = seen
 
@@ -814,7 +828,7 @@ class _LostEnd:
 
     @property
     def where(self) -> str:
-        return segments_text(TELEMETRY, self.hole.first or 0, None).partition(" ")[0]
+        return format_segments(TELEMETRY, self.hole.first or 0, None).partition(" ")[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -846,7 +860,7 @@ def find_shortages(marks: Iterable[StepMark], events: Sequence[Event], metas: It
     """By the steps that are done, in order of time, and all the frames that are there. A step's end is recorded when
     all its frames are on the disk, or counted as lost: so a capture that is done has as many of each camera as it
     says."""
-    begins_ns = begins_of(events)
+    begins_ns = find_restart_times(events)
     counts: Counter[tuple[str, str]] = Counter()
     channels: set[str] = set()
     for meta in metas:
@@ -864,32 +878,32 @@ def find_shortages(marks: Iterable[StepMark], events: Sequence[Event], metas: It
         cameras = [f"{name}.image" for name in names] if isinstance(names, list | tuple) and names else channels or {""}
         missing = sum(max(0, due - counts[mark.step_id, channel]) for channel in cameras)
         if missing:
-            is_reported = missing <= lost_frames_of(mark.step_id, events)
+            is_reported = missing <= count_lost_frames(mark.step_id, events)
             begin_ns = begun_ns.get(mark.step_id, mark.time_ns)
             one = Shortage((mark.step_id,), missing, begin_ns, mark.time_ns, is_reported)
             is_one = follows and found[-1].is_reported == is_reported
-            found.append(_joined(found.pop(), one) if is_one else one)
+            found.append(_join_shortages(found.pop(), one) if is_one else one)
         follows = missing > 0
     return found
 
 
-def _joined(one: Shortage, other: Shortage) -> Shortage:
+def _join_shortages(one: Shortage, other: Shortage) -> Shortage:
     steps, missing = one.step_ids + other.step_ids, one.missing + other.missing
     return Shortage(steps, missing, one.begin_ns, other.end_ns, one.is_reported)
 
 
-def frames_of_plan(planned: int | None, frames: int) -> str:
+def format_planned_frames(planned: int | None, frames: int) -> str:
     """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the number of planned frames
     is not known, or when there are as many."""
     return f"; {frames} of the {planned} frames of the plan are there" if planned and frames < planned else ""
 
 
-def is_of_a_run(events: Iterable[Event], marks: Iterable[StepMark]) -> bool:
+def has_run(events: Iterable[Event], marks: Iterable[StepMark]) -> bool:
     """Whether a run was recorded whose journal was begun: its first step comes after that."""
     return any(event.kind in RUN_BEGINS for event in events) and any(True for _ in marks)
 
 
-def _why(
+def _explain_lost_end(
     end_ns: int,
     is_salvaged: bool,
     last: Event | None,
@@ -920,7 +934,7 @@ def _why(
     return ""
 
 
-def _is_recovered(kept: SegmentFile, salvaged: SegmentSeen | None) -> bool:
+def _is_recovered(kept: SegmentFile, salvaged: ScannedSegment | None) -> bool:
     """Whether the repaired segment has every message of the original: its repair lost no byte, and both have as many.
     The original must reach the end of its data; of one that was cut short the number of messages is unknown."""
     if salvaged is None or salvaged.salvage.get("lost_bytes") != "0":
@@ -934,7 +948,7 @@ def _is_recovered(kept: SegmentFile, salvaged: SegmentSeen | None) -> bool:
     return False
 
 
-def _of_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> Iterator[SessionFinding]:
+def _check_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> Iterator[SessionFinding]:
     """Whether the journal has the lines that it had when the recording ended."""
     due = stated.journal
     if due is None or (journal is not None and journal.damage):
@@ -946,60 +960,64 @@ def _of_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> I
                 data = file.read(due.size_bytes)
     lines = data.count(b"\n")
     if lines < due.lines:
-        yield _missing_part(f"has {lines} of the {due.lines} lines that {MANIFEST_NAME} states", JOURNAL_NAME)
+        yield _make_missing(f"has {lines} of the {due.lines} lines that {MANIFEST_NAME} states", JOURNAL_NAME)
     elif hashlib.sha256(data).hexdigest() != due.sha256:
-        yield _error(f"is not as it was when the recording ended: {MANIFEST_NAME} states another hash", JOURNAL_NAME)
+        yield _make_error(
+            f"is not as it was when the recording ended: {MANIFEST_NAME} states another hash", JOURNAL_NAME
+        )
 
 
-def _of_notes(path: Path) -> Iterator[SessionFinding]:
+def _check_notes(path: Path) -> Iterator[SessionFinding]:
     """What people said of the session."""
     said = read_notes(path)
     if said.damage:
-        yield _error(said.damage, NOTES_NAME)
+        yield _make_error(said.damage, NOTES_NAME)
     if said.unended:
-        yield _note(said.unended, NOTES_NAME)
+        yield _make_note(said.unended, NOTES_NAME)
 
 
-def _format(session: Mapping[str, str]) -> Iterator[SessionFinding]:
+def _check_format(session: Mapping[str, str]) -> Iterator[SessionFinding]:
     """What another version of thermostand may have recorded is not known here."""
-    if text := unknown_format(session):
+    if text := explain_unknown_format(session):
         yield SessionFinding(Severity.ERROR, "", f"{text}: what that format adds was not checked", Files.UNKNOWN)
     elif unknown := sorted(session.keys() - {each.name for each in fields(SessionInfo)}):
         names = ", ".join(name[:40] for name in unknown[:6])
-        yield _note(
+        yield _make_note(
             f"the record of the session has fields that this version does not know: {names}; they were not checked"
         )
 
 
-def _frames_lost(recorded: Recorded, utc: UtcOffsets) -> Iterator[SessionFinding]:
+def _find_lost_frames(recorded: Recorded, utc: UtcOffsets) -> Iterator[SessionFinding]:
     """What the recorder, and what camera and wire lost, as recorded."""
     for event in recorded.events:
         if event.kind == FRAMES_DROPPED:
-            yield _note(f"{utc.local_text(event.time_ns)}: {event.text}")
+            yield _make_note(f"{utc.local_text(event.time_ns)}: {event.text}")
     dropped: Counter[str] = Counter()
     for meta in recorded.metas:
         dropped[meta.step_id] += meta.dropped
     steps = {mark.step_id: f"step {mark.index + 1} ({mark.kind})" for mark in recorded.marks}
     for step_id, count in dropped.items():
         if count:
-            yield _note(f"{_frames(count)} of {steps.get(step_id, 'no step')} lost by the camera or its wire")
+            yield _make_note(
+                f"{_format_frames(count)} of {steps.get(step_id, 'no step')} lost by the camera or its wire"
+            )
 
 
-def _error(text: str, where: str = "") -> SessionFinding:
+def _make_error(text: str, where: str = "") -> SessionFinding:
     return SessionFinding(Severity.ERROR, where, text, Files.DAMAGED)
 
 
-def _missing_part(text: str, where: str = "") -> SessionFinding:
+def _make_missing(text: str, where: str = "") -> SessionFinding:
     return SessionFinding(Severity.ERROR, where, text, Files.INCOMPLETE)
 
 
-def _note(text: str, where: str = "") -> SessionFinding:
+def _make_note(text: str, where: str = "") -> SessionFinding:
     return SessionFinding(Severity.NOTE, where, text)
 
 
-def _frames(count: int) -> str:
+def _format_frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
 
-def _segments(count: int) -> str:
+def _format_segments(count: int) -> str:
     return "1 segment" if count == 1 else f"{count} segments"

@@ -36,7 +36,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from thermostand.recording.format.damage import DAMAGE
 from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
-from thermostand.recording.format.layout import FRAME_TABLE, SEGMENT_METADATA, SESSION_METADATA, contradicts
+from thermostand.recording.format.layout import FRAME_TABLE, SEGMENT_METADATA, SESSION_METADATA, is_contradicting
 from thermostand.recording.format.mcap_bytes import (
     CHUNK,
     CRC,
@@ -45,13 +45,13 @@ from thermostand.recording.format.mcap_bytes import (
     RECORD,
     RECORD_LIMIT_BYTES,
     ChunkHead,
-    bytes_of,
-    chunk_content,
-    records,
-    stream,
+    decompress_chunk,
+    encode_record,
+    iterate_records,
+    make_stream,
 )
-from thermostand.recording.format.messages import frame_table
-from thermostand.recording.format.records import RecordedMessage, recorded_form
+from thermostand.recording.format.messages import encode_frame_table
+from thermostand.recording.format.records import RecordedMessage, find_batch_schema
 from thermostand.recording.format.summary import Summary, read_summary
 
 _DATA_END_BYTES = RECORD.size + CRC.size
@@ -91,17 +91,17 @@ def check_segment(
     check = SegmentCheck(path)
     try:
         with path.open("rb") as file:
-            walk = _Walk(check, file, _indexed(read_summary(file, path.stat().st_size)), receive)
+            walk = _SegmentChecker(check, file, _read_index(read_summary(file, path.stat().st_size)), receive)
             walk.run(report)
             if not check.damages:
                 file.seek(0)
                 check.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except DAMAGE as error:
-        check.damages.append(SegmentDamage(_sentence(error), -inf, inf))
+        check.damages.append(SegmentDamage(_format_error(error), -inf, inf))
     return check
 
 
-def _sentence(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     """Our own sentences are ValueErrors; of the others the type says more than the text."""
     return str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
 
@@ -119,11 +119,11 @@ class _Index:
     channels: Mapping[int, Channel]
 
 
-def _indexed(summary: Summary) -> _Index:
+def _read_index(summary: Summary) -> _Index:
     """The records of the index; raises one of DAMAGE."""
     contents: dict[int, list[ReadDataStream]] = {}
-    for opcode, content in records(summary.content):
-        contents.setdefault(opcode, []).append(stream(content))
+    for opcode, content in iterate_records(summary.content):
+        contents.setdefault(opcode, []).append(make_stream(content))
     schemas = [Schema.read(data) for data in contents.get(Opcode.SCHEMA, ())]
     channels = [Channel.read(data) for data in contents.get(Opcode.CHANNEL, ())]
     chunks = [ChunkIndex.read(data) for data in contents.get(Opcode.CHUNK_INDEX, ())]
@@ -141,7 +141,7 @@ def _indexed(summary: Summary) -> _Index:
     )
 
 
-class _Walk:
+class _SegmentChecker:
     """The walk from the header to the index, place by place."""
 
     def __init__(
@@ -158,19 +158,19 @@ class _Walk:
 
     def run(self, report: Callable[[int], None]) -> None:
         """Read everything; raises one of DAMAGE when the index does not cover the whole file."""
-        places = self._places()
-        self._part(0, places[0], self._header)
+        places = self._list_places()
+        self._read_part(0, places[0], self._check_header)
         for place, end in pairwise(places):
-            self._part(place, end, self._record)
+            self._read_part(place, end, self._check_record)
             report(end)
-        self._part(places[-1], self._index.begin, self._data_end)
+        self._read_part(places[-1], self._index.begin, self._check_data_end)
         metadata = self._check.metadata
-        if contradicts(metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})):
+        if is_contradicting(metadata.get(SEGMENT_METADATA, {}), metadata.get(SESSION_METADATA, {})):
             self._check.damages.append(SegmentDamage("the session's metadata do not fit their CRC"))
         if not self._check.damages:
             self._compare()
 
-    def _places(self) -> list[int]:
+    def _list_places(self) -> list[int]:
         """Where each indexed record begins, in order, and where the last one ends."""
         index = self._index
         ends = {place: place + entry.chunk_length + entry.message_index_length for place, entry in index.chunks.items()}
@@ -183,7 +183,7 @@ class _Walk:
             raise ValueError("the records that its index lists do not follow each other")
         return [*places, last]
 
-    def _part(self, place: int, end: int, read: Callable[[int, bytes], None]) -> None:
+    def _read_part(self, place: int, end: int, read: Callable[[int, bytes], None]) -> None:
         """Read the bytes of one record; damage in it is noted."""
         try:
             if end - place > _PART_LIMIT_BYTES:
@@ -193,39 +193,39 @@ class _Walk:
         except DAMAGE as error:
             entry = self._index.chunks.get(place)
             times_ns = (entry.message_start_time, entry.message_end_time) if entry else (inf, -inf)
-            self._check.damages.append(SegmentDamage(f"{_sentence(error)} (at byte {place})", *times_ns))
+            self._check.damages.append(SegmentDamage(f"{_format_error(error)} (at byte {place})", *times_ns))
 
-    def _header(self, place: int, data: bytes) -> None:
+    def _check_header(self, place: int, data: bytes) -> None:
         content = data[len(MCAP0_MAGIC) + RECORD.size :]
-        header = Header.read(stream(content))
-        if data != MCAP0_MAGIC + bytes_of(header) or header.profile:
+        header = Header.read(make_stream(content))
+        if data != MCAP0_MAGIC + encode_record(header) or header.profile:
             raise ValueError("its first bytes are not the header of one of our files")
 
-    def _record(self, place: int, data: bytes) -> None:
+    def _check_record(self, place: int, data: bytes) -> None:
         index = self._index
         content = data[RECORD.size :]
         if place in index.chunks:
-            self._chunk(index.chunks[place], data)
+            self._check_chunk(index.chunks[place], data)
         elif place in index.attachments:
-            attachment = Attachment.read(stream(content))
-            _check_same(bytes_of(attachment), data, "an attachment")
+            attachment = Attachment.read(make_stream(content))
+            _check_same(encode_record(attachment), data, "an attachment")
             if attachment.name == FRAME_TABLE:
                 self._table = attachment.data
             else:
                 self._check.texts[attachment.name] = attachment.data.decode(errors="surrogateescape")
         else:
-            metadata = Metadata.read(stream(content))
-            _check_same(bytes_of(metadata), data, "a metadata record")
+            metadata = Metadata.read(make_stream(content))
+            _check_same(encode_record(metadata), data, "a metadata record")
             if metadata.name != index.metadata[place].name:
                 raise ValueError("a metadata record has another name than in the index")
             self._check.metadata[metadata.name] = metadata.metadata
 
-    def _chunk(self, entry: ChunkIndex, data: bytes) -> None:
+    def _check_chunk(self, entry: ChunkIndex, data: bytes) -> None:
         """A chunk and the message indexes behind it."""
-        head, content = chunk_content(memoryview(data)[RECORD.size : entry.chunk_length])
-        _check_same(_head_bytes(head, entry), data[: RECORD.size + head.begin], "the head of a chunk")
-        messages = self._contents(content)
-        offsets, indexes = _message_indexes(messages, entry.chunk_start_offset + entry.chunk_length)
+        head, content = decompress_chunk(memoryview(data)[RECORD.size : entry.chunk_length])
+        _check_same(_encode_head(head, entry), data[: RECORD.size + head.begin], "the head of a chunk")
+        messages = self._read_contents(content)
+        offsets, indexes = _encode_message_indexes(messages, entry.chunk_start_offset + entry.chunk_length)
         _check_same(indexes, data[entry.chunk_length :], "the index of a chunk's messages")
         times_ns = [message.time_ns for message in messages]
         rebuilt = ChunkIndex(
@@ -244,30 +244,30 @@ class _Walk:
         for message in messages:
             self._count(message)
 
-    def _contents(self, data: memoryview) -> list[_Placed]:
+    def _read_contents(self, data: memoryview) -> list[_PlacedMessage]:
         """The messages of a chunk; its schemas and channels are learnt."""
-        placed: list[_Placed] = []
+        placed: list[_PlacedMessage] = []
         offset = 0
-        for opcode, content in records(data):
+        for opcode, content in iterate_records(data):
             if opcode == Opcode.MESSAGE:
                 number, sequence, time_ns, _ = MESSAGE.unpack_from(content)
                 channel = self._index.channels[number]  # the first chunk, which has it too, may be damaged
                 schema = self._index.schemas[channel.schema_id].name
                 data_bytes = b"" if schema == IMAGE_SCHEMA else bytes(content[MESSAGE.size :])
-                message = RecordedMessage(channel.topic, sequence, time_ns, data_bytes, recorded_form(channel))
-                placed.append(_Placed(number, offset, time_ns, schema, message))
+                message = RecordedMessage(channel.topic, sequence, time_ns, data_bytes, find_batch_schema(channel))
+                placed.append(_PlacedMessage(number, offset, time_ns, schema, message))
             elif opcode == Opcode.SCHEMA:
-                schema = Schema.read(stream(content))
+                schema = Schema.read(make_stream(content))
                 self._schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                known = Channel.read(stream(content))
+                known = Channel.read(make_stream(content))
                 self._channels[known.id] = known
             else:
                 raise ValueError(f"a chunk holds a record of kind {opcode}")
             offset += RECORD.size + len(content)
         return placed
 
-    def _count(self, placed: _Placed) -> None:
+    def _count(self, placed: _PlacedMessage) -> None:
         check = self._check
         check.messages += 1
         check.first_ns = min(check.first_ns, placed.time_ns)
@@ -278,7 +278,7 @@ class _Walk:
         elif placed.schema != IMAGE_SCHEMA:
             self._receive(placed.message)
 
-    def _data_end(self, place: int, data: bytes) -> None:
+    def _check_data_end(self, place: int, data: bytes) -> None:
         """Our writer makes no CRC of the whole data section (0): chunks and attachments have their own."""
         _check_same(RECORD.pack(Opcode.DATA_END, CRC.size) + CRC.pack(0), data, "the end of the data")
 
@@ -288,7 +288,7 @@ class _Walk:
         # Schemas and channels go into the first chunk; a segment without a message has none.
         if index.chunks and (self._schemas, self._channels) != (index.schemas, index.channels):
             raise ValueError("its schemas or channels are not those in its index")
-        if (self._table or b"") != frame_table(check.descriptions):
+        if (self._table or b"") != encode_frame_table(check.descriptions):
             raise ValueError("its table of frames is not that of its frames")
         found = Statistics(
             attachment_count=len(index.attachments),
@@ -305,7 +305,7 @@ class _Walk:
             raise ValueError("it does not hold the messages that its index lists")
 
 
-class _Placed(NamedTuple):
+class _PlacedMessage(NamedTuple):
     """A message, its channel's number, where it begins in its chunk, and its schema's name."""
 
     channel: int
@@ -315,7 +315,7 @@ class _Placed(NamedTuple):
     message: RecordedMessage
 
 
-def _head_bytes(head: ChunkHead, entry: ChunkIndex) -> bytes:
+def _encode_head(head: ChunkHead, entry: ChunkIndex) -> bytes:
     """What stands before the data of a chunk, by the index where that has it."""
     name = entry.compression.encode()
     times_ns = entry.message_start_time, entry.message_end_time
@@ -327,7 +327,7 @@ def _head_bytes(head: ChunkHead, entry: ChunkIndex) -> bytes:
     )
 
 
-def _message_indexes(messages: list[_Placed], place: int) -> tuple[dict[int, int], bytes]:
+def _encode_message_indexes(messages: list[_PlacedMessage], place: int) -> tuple[dict[int, int], bytes]:
     """The message indexes that belong behind a chunk, from `place` on: where each channel's is, and their bytes."""
     entries: dict[int, list[tuple[int, int]]] = {}
     for message in messages:
@@ -336,7 +336,7 @@ def _message_indexes(messages: list[_Placed], place: int) -> tuple[dict[int, int
     data = b""
     for channel, places in entries.items():
         offsets[channel] = place + len(data)
-        data += bytes_of(MessageIndex(channel, places))
+        data += encode_record(MessageIndex(channel, places))
     return offsets, data
 
 

@@ -20,44 +20,44 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from thermostand.foundation.errors import NotThere, SessionError
+from thermostand.foundation.errors import NotFound, SessionError
 from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Event, Item, Original, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import READINGS
-from thermostand.recording.format.damage import FileDamaged, naming
+from thermostand.recording.format.damage import FileDamaged, name_file_in_errors
 from thermostand.recording.format.decoded_items import (
     RecordedImage,
-    event_of,
-    frame_of,
-    item_of,
-    recorded_image,
-    stands_for_item,
-    step_of,
+    decode_event_item,
+    decode_frame,
+    decode_item,
+    decode_step_item,
+    is_item_channel,
+    read_recorded_image,
 )
 from thermostand.recording.format.holes import Hole
-from thermostand.recording.format.inventory import SegmentState, inventory, misplaced
+from thermostand.recording.format.inventory import SegmentState, is_misplaced, list_segments
 from thermostand.recording.format.layout import (
     FINISHED,
     FRAMES,
     TELEMETRY,
-    unknown_format,
+    explain_unknown_format,
 )
 from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.records import (
     FramePlace,
     Head,
     RecordedMessage,
-    frame_places,
+    list_frame_places,
     read_head,
-    telemetry_messages,
+    read_telemetry_messages,
 )
-from thermostand.recording.format.utc_offsets import UtcOffsets, offsets_of
+from thermostand.recording.format.utc_offsets import UtcOffsets, collect_offsets
 from thermostand.recording.reading.columns import ChannelColumn, ReadingColumns
-from thermostand.recording.reading.frames_table import FramesTable, frames_table
-from thermostand.recording.reading.run_word import Files, RunOutcome
-from thermostand.recording.reading.scan import Depth, Scan, frames_of_plan, scan
+from thermostand.recording.reading.frames_table import FramesTable, build_frames_table
+from thermostand.recording.reading.run_status import Files, RunOutcome
+from thermostand.recording.reading.scan import Depth, Scan, format_planned_frames, scan
 
 if TYPE_CHECKING:
     from thermostand.recording.reading.lazy_arrays import SessionArrays
@@ -77,7 +77,7 @@ class Session:
 
     def __init__(self, path: Path, telemetry: list[Path], frames: list[Path]) -> None:
         self.path = path
-        files = inventory(path)
+        files = list_segments(path)
         self.incomplete = tuple(file.path for file in files if file.state in _UNFINISHED)
         self.damaged = tuple(file.path for file in files if file.state is SegmentState.DAMAGED)
         self._telemetry = telemetry
@@ -85,7 +85,7 @@ class Session:
         head = read_head(telemetry[0])
         self.metadata = head.session
         self._attachments = head.attachments
-        if text := unknown_format(self.metadata):
+        if text := explain_unknown_format(self.metadata):
             raise SessionError(f"{path}: {text}")
         self._heads: dict[Path, Head] = {}  # of the segments that are known to belong here
         for segment in (*telemetry, *frames):  # metadata has no CRC, but a second copy in the others
@@ -94,22 +94,22 @@ class Session:
         self._columns: dict[str, dict[str, ChannelColumn]] = {}  # device -> channel -> column
         self._all_columns_read = False
         self._units: dict[str, str] = {}
-        self._doubted: dict[str, list[int]] = {}
+        self._uncertain: dict[str, list[int]] = {}
         self._places_of: dict[Path, list[FramePlace]] = {}
 
     @classmethod
     def open(cls, path: Path | str) -> Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
         path = Path(path)
-        files = inventory(path)
+        files = list_segments(path)
         finished = [file for file in files if file.state is SegmentState.FINISHED]
         telemetry, frames = ([file.path for file in finished if file.series == name] for name in (TELEMETRY, FRAMES))
         if not telemetry and not path.is_dir():
-            raise NotThere(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
+            raise NotFound(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
         if not telemetry:
             count = sum(file.state in _UNFINISHED for file in files)
             unfinished = f", only {count} unfinished ones" if count else ""
-            kind = SessionError if count else NotThere
+            kind = SessionError if count else NotFound
             raise kind(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
         return cls(path, telemetry, frames)
 
@@ -139,7 +139,7 @@ class Session:
 
     def channels(self) -> list[str]:
         """The channels that have readings, sorted."""
-        return sorted(self._all_columns())
+        return sorted(self._read_all_columns())
 
     def units(self) -> Mapping[str, str]:
         """The unit of each channel that has readings. One whose unit was another one before has it in its name,
@@ -152,7 +152,7 @@ class Session:
         device = channel.partition(".")[0]
         if device not in self._columns and not self._all_columns_read:
             self._columns[device] = self._read_columns(device).get(device, {})
-        found = self._columns.get(device, {}).get(channel) or self._all_columns().get(channel)
+        found = self._columns.get(device, {}).get(channel) or self._read_all_columns().get(channel)
         if found is None:
             raise SessionError(f"{self.path}: has no channel {channel}; there are {', '.join(self.channels())}")
         return found
@@ -160,10 +160,10 @@ class Session:
     def believed(self, channel: str) -> ChannelColumn:
         """As `readings`, without those that were recorded in doubt."""
         times_ns, values = self.readings(channel)
-        kept = ~np.isin(times_ns, self._doubted.get(channel, []))
+        kept = ~np.isin(times_ns, self._uncertain.get(channel, []))
         return ChannelColumn(times_ns[kept], values[kept])
 
-    def _all_columns(self) -> dict[str, ChannelColumn]:
+    def _read_all_columns(self) -> dict[str, ChannelColumn]:
         if not self._all_columns_read:
             self._columns = self._read_columns(None)
             self._all_columns_read = True
@@ -176,27 +176,27 @@ class Session:
         def is_wanted(channel: Channel) -> bool:
             return channel.topic.startswith(READINGS) and device in (None, channel.topic.removeprefix(READINGS))
 
-        for _ in self._decoded(is_wanted, found.add):
+        for _ in self._decode(is_wanted, found.add):
             pass
-        with naming(self.path / TELEMETRY):
+        with name_file_in_errors(self.path / TELEMETRY):
             columns = found.columns()
         self._units |= found.units
-        self._doubted |= found.doubted
+        self._uncertain |= found.doubted
         return columns
 
     def steps(self) -> list[StepMark]:
         """Every step mark, in order of time."""
-        found = self._decoded(lambda channel: channel.topic == messages.STEP, step_of)
+        found = self._decode(lambda channel: channel.topic == messages.STEP, decode_step_item)
         return sorted(found, key=attrgetter("time_ns"))
 
     def events(self) -> list[Event]:
         """Every event, in order of time."""
-        found = self._decoded(lambda channel: channel.topic == messages.EVENT, event_of)
+        found = self._decode(lambda channel: channel.topic == messages.EVENT, decode_event_item)
         return sorted(found, key=attrgetter("time_ns"))
 
     def originals(self) -> Iterator[Original]:
         """The thermal imager's pictures as their files were, in the order of the recording, each read when asked."""
-        return self._decoded(
+        return self._decode(
             lambda channel: channel.topic == messages.ORIGINAL,
             lambda message: messages.decode_original(message.data, message.time_ns),
         )
@@ -204,7 +204,7 @@ class Session:
     @cached_property
     def utc(self) -> UtcOffsets:
         """From its instants to UTC as the host's system clock had it."""
-        return offsets_of(self.events())
+        return collect_offsets(self.events())
 
     @property
     def frame_count(self) -> int:
@@ -214,11 +214,11 @@ class Session:
     @property
     def frame_times_ns(self) -> NDArray[np.int64]:
         """Middle of the exposure of each frame, shape (frame_count,), ascending."""
-        return np.array([place.time_ns for place in self._places()], np.int64)
+        return np.array([place.time_ns for place in self._iterate_places()], np.int64)
 
     def frames_table(self) -> FramesTable:
         """What is known of each frame as columns; no image is decoded."""
-        return frames_table(self, list(self._places()))
+        return build_frames_table(self, list(self._iterate_places()))
 
     def to_xarray(self) -> SessionArrays:
         """The frames of each camera as a Dataset with a lazy dask array, and `telemetry` as another; only the tables of
@@ -227,26 +227,26 @@ class Session:
             import_extra(package, "arrays")
         from thermostand.recording.reading.lazy_arrays import SessionArrays  # a program that has none need not wait
 
-        return SessionArrays(self, list(self._places()), lambda: self.utc)
+        return SessionArrays(self, list(self._iterate_places()), lambda: self.utc)
 
     def frame(self, index: int) -> Frame:
         """The frame of that index, counted from 0 in order of time; SessionError when there is none."""
         if not 0 <= index < self.frame_count:
             raise SessionError(f"{self.path}: has no frame {index}; it has {self.frame_count}, counted from 0")
         if not self._is_in_order:
-            return frame_of(recorded_image(self._sorted_places[index]))
+            return decode_frame(read_recorded_image(self._sorted_places[index]))
         ends = list(accumulate(self._frames_in_segments))
         number = bisect_right(ends, index)
-        places = self._places_in(self._frames[number])
-        return frame_of(recorded_image(places[index - ends[number]]))  # counted from the segment's end
+        places = self._list_places_in(self._frames[number])
+        return decode_frame(read_recorded_image(places[index - ends[number]]))  # counted from the segment's end
 
     def frames(self) -> Iterator[Frame]:
         """The frames in order of time, each read and decoded when asked for."""
-        return map(frame_of, self.images())
+        return map(decode_frame, self.images())
 
     def images(self) -> Iterator[RecordedImage]:
         """The images in order of time as they were recorded, each read when asked for and not decoded."""
-        return map(recorded_image, self._places())
+        return map(read_recorded_image, self._iterate_places())
 
     def items(self) -> Iterator[Item]:
         """Every batch, frame, step mark and event in the order of their publication, each read when asked for.
@@ -256,24 +256,24 @@ class Session:
     def published(self) -> Iterator[tuple[int, Item]]:
         """As `items`, with the instants of their publication. A frame comes behind what was published at its instant,
         but before the end of its step."""
-        frames = iter(sorted(self._places(), key=attrgetter("meta.published_ns")))
+        frames = iter(sorted(self._iterate_places(), key=attrgetter("meta.published_ns")))
         place = next(frames, None)
-        for item in self._decoded(stands_for_item, item_of):
+        for item in self._decode(is_item_channel, decode_item):
             ended = item.step_id if isinstance(item, StepMark) and item.state is not StepState.STARTED else None
             while place is not None and (
                 place.meta.published_ns < item.time_ns
                 or (place.meta.published_ns == item.time_ns and place.meta.step_id == ended)
             ):
-                yield place.meta.published_ns, frame_of(recorded_image(place))
+                yield place.meta.published_ns, decode_frame(read_recorded_image(place))
                 place = next(frames, None)
             yield item.time_ns, item
         while place is not None:
-            yield place.meta.published_ns, frame_of(recorded_image(place))
+            yield place.meta.published_ns, decode_frame(read_recorded_image(place))
             place = next(frames, None)
 
     def frame_metas(self) -> list[messages.FrameMeta]:
         """The description of every frame, in order of time."""
-        return [place.meta for place in self._places()]
+        return [place.meta for place in self._iterate_places()]
 
     @property
     def _frames_in_segments(self) -> list[int]:
@@ -286,29 +286,29 @@ class Session:
         spans = [span for path in self._frames if (span := self._check(path).span).count]
         return all(earlier.last_ns <= later.first_ns for earlier, later in pairwise(spans))
 
-    def _places(self) -> Iterator[FramePlace]:
+    def _iterate_places(self) -> Iterator[FramePlace]:
         """The frames in order of time."""
         if self._is_in_order:
-            return chain.from_iterable(map(self._places_in, self._frames))
+            return chain.from_iterable(map(self._list_places_in, self._frames))
         return iter(self._sorted_places)
 
     @cached_property
     def _sorted_places(self) -> list[FramePlace]:
-        return sorted(chain.from_iterable(map(self._places_in, self._frames)), key=attrgetter("time_ns"))
+        return sorted(chain.from_iterable(map(self._list_places_in, self._frames)), key=attrgetter("time_ns"))
 
-    def _places_in(self, segment: Path) -> list[FramePlace]:
+    def _list_places_in(self, segment: Path) -> list[FramePlace]:
         """The frames of one segment in order of time."""
         if segment not in self._places_of:
             self._check(segment)
-            self._places_of[segment] = sorted(frame_places(segment), key=attrgetter("time_ns"))
+            self._places_of[segment] = sorted(list_frame_places(segment), key=attrgetter("time_ns"))
         return self._places_of[segment]
 
-    def _decoded(self, wanted: Callable[[Channel], bool], decode: Callable[[RecordedMessage], T]) -> Iterator[T]:
+    def _decode(self, wanted: Callable[[Channel], bool], decode: Callable[[RecordedMessage], T]) -> Iterator[T]:
         """The telemetry of the wanted channels in the order of the files, each message decoded."""
         for path in self._telemetry:
             self._check(path)
-            for message in telemetry_messages(path, wanted):
-                with naming(path):
+            for message in read_telemetry_messages(path, wanted):
+                with name_file_in_errors(path):
                     item = decode(message)
                 yield item
 
@@ -345,14 +345,14 @@ class Session:
             raise SessionError(
                 f"{segment}: has other texts attached than {self._telemetry[0]}; one of them was changed"
             )
-        if head.place and misplaced(segment.parent.name, _number_of(segment), head.place, head.session):
+        if head.place and is_misplaced(segment.parent.name, _parse_number(segment), head.place, head.session):
             where = f"{head.place.get('series')}/{head.place.get('number')}{FINISHED}"
             raise SessionError(f"{segment}: was recorded as {where}; give it that name again, or move it away")
         self._heads[segment] = head
         return head
 
 
-def _number_of(segment: Path) -> int:
+def _parse_number(segment: Path) -> int:
     return int(segment.name.partition(".")[0])
 
 
@@ -382,7 +382,11 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
     if not missing:
         return
     more = [f"{len(missing) - _MOST} more"] if len(missing) > _MOST else []
-    plan = frames_of_plan(session.scanned.planned, session.frame_count) if session.run is RunOutcome.COMPLETE else ""
+    plan = (
+        format_planned_frames(session.scanned.planned, session.frame_count)
+        if session.run is RunOutcome.COMPLETE
+        else ""
+    )
     sentence = f"{path}: is incomplete; missing: {'; '.join([*missing[:_MOST], *more])}{plan}"
     if incomplete is None:
         raise SessionError(f"{sentence}; use --incomplete to read the rest")
@@ -391,7 +395,7 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
 
 def _check_finished(path: Path, incomplete: Say | None) -> None:
     """Segments that a killed recorder has left are not read: a repair finishes them."""
-    left = [file.name for file in inventory(path) if file.state is SegmentState.UNFINISHED]
+    left = [file.name for file in list_segments(path) if file.state is SegmentState.UNFINISHED]
     if not left:
         return
     sentence = f"{path}: {left[0]} {'is' if len(left) == 1 else f'and {len(left) - 1} more are'} not finished and"

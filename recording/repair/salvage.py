@@ -1,8 +1,8 @@
 """Unfinished and damaged segments become finished ones: nothing valid is lost, nothing invalid is delivered.
 
-What proves itself (recording/reading/walk.py) is copied message by message into a segment of the usual form, with a
-metadata record `salvage` that says from what. The copy is written as `NNNN.mcap.tmp`, synced and renamed; only then
-the original goes. It goes when the copy holds all of it but a block that was being written and never acknowledged;
+What proves itself (recording/reading/segment_scan.py) is copied message by message into a segment of the usual form,
+with a metadata record `repair` that says from what. The copy is written as `NNNN.mcap.tmp`, synced and renamed; only
+then the original goes. It goes when the copy holds all of it but a block that was being written and never acknowledged;
 else it stays, as `NNNN.mcap.damaged`. A repair that is killed is repeated, and one of a recording that is still
 under way (its recorder holds a lock on the segment) leaves that alone.
 """
@@ -26,7 +26,7 @@ from mcap.writer import CompressionType
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import sync_folder
 from thermostand.recording.format.images import ZSTD_LEVEL
-from thermostand.recording.format.inventory import SegmentState, inventory
+from thermostand.recording.format.inventory import SegmentState, list_segments
 from thermostand.recording.format.layout import (
     DAMAGED,
     FINISHED,
@@ -37,12 +37,12 @@ from thermostand.recording.format.layout import (
     TELEMETRY,
     TEMPORARY,
     UNFINISHED,
-    segment_metadata,
+    make_segment_metadata,
 )
 from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.mcap_bytes import Source
 from thermostand.recording.reading.segment_check import check_segment
-from thermostand.recording.reading.walk import StoredMessage, Survey, stored_messages, survey
+from thermostand.recording.reading.segment_scan import SegmentScan, StoredMessage, read_stored_messages, scan_segment
 from thermostand.recording.writing.locks import lock
 from thermostand.recording.writing.manifest_file import complete_manifest
 from thermostand.recording.writing.mcap_writer import McapWriter
@@ -63,7 +63,7 @@ SESSION_ID = "session_id"
 
 
 @dataclass(frozen=True, slots=True)
-class Opening:
+class SegmentOpening:
     """Metadata `session`, attachments by name, schemas and channels by number."""
 
     session: Mapping[str, str]
@@ -79,13 +79,13 @@ class Opening:
 @dataclass(frozen=True, slots=True)
 class _Sibling:
     path: Path
-    found: Survey
+    found: SegmentScan
 
 
-def opening_of(path: Path, own: Survey) -> Opening | None:
+def find_opening(path: Path, own: SegmentScan) -> SegmentOpening | None:
     """The opening for the segment at `path`, of which `own` proved itself; None when its session is not known."""
-    siblings = [sibling for sibling in _siblings(path) if _agree(own, sibling.found)]
-    session = _session(own, siblings)
+    siblings = [sibling for sibling in _iterate_siblings(path) if _is_same_session(own, sibling.found)]
+    session = _vote_session(own, siblings)
     if session is None:
         return None
     attachments = dict(own.attachments)
@@ -94,63 +94,67 @@ def opening_of(path: Path, own: Survey) -> Opening | None:
         for sibling in siblings:
             attachments = sibling.found.attachments | attachments
     if own.messages.keys() - own.channels.keys():
-        schemas, channels = _tables(own, [sibling.found for sibling in siblings if sibling.path.parent == path.parent])
-    return Opening(session, attachments, schemas, channels)
+        schemas, channels = _complete_tables(
+            own, [sibling.found for sibling in siblings if sibling.path.parent == path.parent]
+        )
+    return SegmentOpening(session, attachments, schemas, channels)
 
 
-def segments_of(series: Path) -> list[Path]:
+def list_segment_files(series: Path) -> list[Path]:
     """The finished and unfinished segments in a folder; none when there is no such folder."""
-    files = (file for file in inventory(series.parent) if file.series == series.name)
+    files = (file for file in list_segments(series.parent) if file.series == series.name)
     return [file.path for file in files if file.state is not SegmentState.DAMAGED and file.number <= _GREATEST]
 
 
-def _siblings(path: Path) -> Iterator[_Sibling]:
+def _iterate_siblings(path: Path) -> Iterator[_Sibling]:
     """The nearest other segments of the session, each read to its first chunk."""
-    number = _number(path)
+    number = _parse_number(path)
     for series in (path.parent.parent / TELEMETRY, path.parent.parent / FRAMES):
-        segments = [other for other in segments_of(series) if other != path]
-        segments.sort(key=lambda other: (abs(_number(other) - number), other.name))
+        segments = [other for other in list_segment_files(series) if other != path]
+        segments.sort(key=lambda other: (abs(_parse_number(other) - number), other.name))
         for other in segments[:SIBLINGS_PER_SERIES]:
             with suppress(OSError):  # what cannot be read does not help
-                yield _Sibling(other, _read_opening(other))
+                yield _Sibling(other, _scan_opening(other))
 
 
-def _number(path: Path) -> int:
+def _parse_number(path: Path) -> int:
     return int(path.name.partition(".")[0])
 
 
-def _read_opening(path: Path) -> Survey:
+def _scan_opening(path: Path) -> SegmentScan:
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        return survey(Source(fd), to_first_chunk=True)
+        return scan_segment(Source(fd), to_first_chunk=True)
     finally:
         os.close(fd)
 
 
-def _identity(session: Mapping[str, str]) -> tuple[str, str]:
+def _get_identity(session: Mapping[str, str]) -> tuple[str, str]:
     return session.get(SESSION_ID, ""), session.get("uid", "")
 
 
-def _agree(one: Survey, other: Survey) -> bool:
+def _is_same_session(one: SegmentScan, other: SegmentScan) -> bool:
     """Whether nothing that is known of both says that they are of different sessions."""
-    if one.session and other.session and _identity(one.session) != _identity(other.session):
+    if one.session and other.session and _get_identity(one.session) != _get_identity(other.session):
         return False
     both = one.attachments.keys() & other.attachments.keys()
     return all(one.attachments[name].data == other.attachments[name].data for name in both)
 
 
-def _session(own: Survey, siblings: list[_Sibling]) -> Mapping[str, str] | None:
+def _vote_session(own: SegmentScan, siblings: list[_Sibling]) -> Mapping[str, str] | None:
     """The session's metadata by vote; None when no segment has it, or the siblings are of several sessions."""
     finished = [sibling.found.session for sibling in siblings if sibling.path.name.endswith(FINISHED)]
     unfinished = [sibling.found.session for sibling in siblings if not sibling.path.name.endswith(FINISHED)]
     votes = [session for session in (*finished, own.session, *unfinished) if session]
-    if len({_identity(session) for session in votes}) != 1:
+    if len({_get_identity(session) for session in votes}) != 1:
         return None
     ((winner, _),) = Counter(tuple(session.items()) for session in votes).most_common(1)
     return dict(winner)
 
 
-def _tables(own: Survey, siblings: Iterable[Survey]) -> tuple[Mapping[int, Schema], Mapping[int, Channel]]:
+def _complete_tables(
+    own: SegmentScan, siblings: Iterable[SegmentScan]
+) -> tuple[Mapping[int, Schema], Mapping[int, Channel]]:
     """Schemas and channels completed from the siblings of the series, if these are of one mind and do not contradict
     the own; else the own."""
     tables = [(sibling.schemas, sibling.channels) for sibling in siblings if sibling.channels]
@@ -172,11 +176,11 @@ def no_report(share: float, text: str) -> None:
     """No progress is shown."""
 
 
-class ShareDone:
+class ShareProgress:
     """Of `paths`; each is read from its begin to its end, perhaps more than once."""
 
     def __init__(self, paths: Iterable[Path], report: ReportShare) -> None:
-        self._sizes = {path: _size(path) for path in paths}
+        self._sizes = {path: _get_size(path) for path in paths}
         self._total = max(1, sum(self._sizes.values()))
         self._report = report
         self._done = 0
@@ -191,7 +195,7 @@ class ShareDone:
         self._report(min(1.0, self._done / self._total), path.name)
 
 
-def _size(path: Path) -> int:
+def _get_size(path: Path) -> int:
     with suppress(OSError):
         return path.stat().st_size
     return 0
@@ -225,7 +229,7 @@ def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Sa
     folders = [directory / series for series in (TELEMETRY, FRAMES) if (directory / series).is_dir()]
     if not folders:
         raise SessionError(f"{directory}: not a session: it has neither {TELEMETRY} nor {FRAMES}")
-    return [*_salvage_folders(folders, True, report), *_manifest_of(directory)]
+    return [*_salvage_folders(folders, True, report), *_update_manifest(directory)]
 
 
 def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salvaged]:
@@ -234,44 +238,47 @@ def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salv
     left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
     folders = [folder for folder in sorted(left, reverse=True) if folder.name in LEVELS]  # telemetry is first
     found = _salvage_folders(folders, False, report)
-    return [*found, *chain.from_iterable(_manifest_of(directory) for directory in sorted({f.parent for f in folders}))]
+    return [
+        *found,
+        *chain.from_iterable(_update_manifest(directory) for directory in sorted({f.parent for f in folders})),
+    ]
 
 
-def _manifest_of(directory: Path) -> Iterator[Salvaged]:
+def _update_manifest(directory: Path) -> Iterator[Salvaged]:
     """`session.json` lists what has been salvaged; reported where it had to be made anew."""
-    files = inventory(directory)
+    files = list_segments(directory)
     if any(file.state is SegmentState.RECORDING for file in files) or all(
         file.state is SegmentState.DAMAGED for file in files
     ):
         return  # its recorder writes it, or there is nothing to list
     path = directory / MANIFEST_NAME
-    with _refusing(path), suppress(SessionError):
+    with _convert_disk_errors(path), suppress(SessionError):
         if reason := complete_manifest(directory):
             yield Salvaged(path, path, 0, 0, reason, None)
 
 
 def _salvage_folders(folders: Iterable[Path], finished_too: bool, report: ReportShare) -> list[Salvaged]:
-    found = [(folder, segments_of(folder)) for folder in folders]
+    found = [(folder, list_segment_files(folder)) for folder in folders]
     wanted = [path for _, paths in found for path in paths if finished_too or path.name.endswith(UNFINISHED)]
-    share = ShareDone(wanted, report)
+    share = ShareProgress(wanted, report)
     return [done for folder, _ in found for done in _salvage_folder(folder, finished_too, share)]
 
 
-def _salvage_folder(folder: Path, finished_too: bool, share: ShareDone) -> Iterator[Salvaged]:
+def _salvage_folder(folder: Path, finished_too: bool, share: ShareProgress) -> Iterator[Salvaged]:
     for copy in folder.glob(f"*{TEMPORARY}"):
         _remove_left_over(copy)
-    for number in sorted({int(path.name.partition(".")[0]) for path in segments_of(folder)}):
+    for number in sorted({int(path.name.partition(".")[0]) for path in list_segment_files(folder)}):
         yield from _salvage_number(folder / f"{number:04d}{FINISHED}", finished_too, share)
 
 
 def _remove_left_over(copy: Path) -> None:
     """Remove what a killed repair has left; not what one that lives is writing."""
-    with _refusing(copy), _locked(copy) as fd:
+    with _convert_disk_errors(copy), _lock_file(copy) as fd:
         if fd is not None:
             copy.unlink()
 
 
-def _salvage_number(finished: Path, finished_too: bool, share: ShareDone) -> Iterator[Salvaged]:
+def _salvage_number(finished: Path, finished_too: bool, share: ShareProgress) -> Iterator[Salvaged]:
     """The finished segment of a number first: the unfinished one beside it is compared with what it holds."""
     part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
     has_part = part.is_file()
@@ -283,13 +290,13 @@ def _salvage_number(finished: Path, finished_too: bool, share: ShareDone) -> Ite
         share.finished(part)
 
 
-def _is_sound(path: Path, share: ShareDone) -> bool:
+def _is_sound(path: Path, share: ShareProgress) -> bool:
     """Whether every byte of a finished segment is as it was written."""
     return not check_segment(path, lambda message: None, share.within(path)).damages
 
 
 @contextmanager
-def _refusing(path: Path) -> Generator[None]:
+def _convert_disk_errors(path: Path) -> Generator[None]:
     """What the disk refuses inside becomes a SessionError that names the file."""
     try:
         yield
@@ -298,7 +305,7 @@ def _refusing(path: Path) -> Generator[None]:
 
 
 @contextmanager
-def _locked(path: Path) -> Generator[int | None]:
+def _lock_file(path: Path) -> Generator[int | None]:
     """The file, opened and locked; None when another process has it, or has just renamed it."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name is never waited for
@@ -323,20 +330,20 @@ class _Original:
     path: Path
     finished: Path
     source: Source
-    found: Survey
-    opening: Opening | None
+    found: SegmentScan
+    opening: SegmentOpening | None
 
     def messages(self) -> Iterator[tuple[Channel, StoredMessage]]:
         """What can be delivered, in order."""
-        return chain.from_iterable(self.chunks())
+        return chain.from_iterable(self.iterate_chunks())
 
-    def chunks(self) -> Iterator[list[tuple[Channel, StoredMessage]]]:
+    def iterate_chunks(self) -> Iterator[list[tuple[Channel, StoredMessage]]]:
         """The same, chunk by chunk."""
         opening = self.opening
         if opening is None:
             return
         for place in self.found.chunks:
-            found = stored_messages(self.source, place)
+            found = read_stored_messages(self.source, place)
             yield [(opening.channels[each.channel], each) for each in found if opening.knows(each.channel)]
 
     @property
@@ -351,50 +358,50 @@ class _Original:
         return self.found.messages.total() - self.delivered
 
     @property
-    def is_all_there(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether a copy holds all that was ever acknowledged; of a finished, damaged segment that is unknown."""
         return self.path != self.finished and not self.found.damages and not self.unknown
 
 
-def _salvage_segment(path: Path, share: ShareDone) -> Salvaged:
+def _salvage_segment(path: Path, share: ShareProgress) -> Salvaged:
     """One segment; SessionError when the disk refuses."""
     finished = path.with_name(f"{path.name.partition('.')[0]}{FINISHED}")
-    with _refusing(path), _locked(path) as fd:
+    with _convert_disk_errors(path), _lock_file(path) as fd:
         if fd is None:
             return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
         source = Source(fd)
-        found = survey(source, report=share.within(path))
-        original = _Original(path, finished, source, found, opening_of(path, found))
+        found = scan_segment(source, report=share.within(path))
+        original = _Original(path, finished, source, found, find_opening(path, found))
         if path != finished and finished.exists():
-            return _salvage_beside(original)
+            return _salvage_unfinished_pair(original)
         return _salvage_alone(original)
 
 
 def _salvage_alone(original: _Original) -> Salvaged:
-    if original.delivered or (original.opening is not None and _is_the_only_telemetry(original)):
-        with _copy_of(original) as copy:
+    if original.delivered or (original.opening is not None and _is_only_telemetry(original)):
+        with _make_copy(original) as copy:
             return _settle(original, original.finished, copy)
     return _settle(original, None)
 
 
-def _is_the_only_telemetry(original: _Original) -> bool:
+def _is_only_telemetry(original: _Original) -> bool:
     """Without any telemetry, empty or not, the session's frames could not be opened."""
     folder = original.path.parent
-    frames = segments_of(folder.parent / FRAMES)
-    return folder.name == TELEMETRY and bool(frames) and segments_of(folder) == [original.path]
+    frames = list_segment_files(folder.parent / FRAMES)
+    return folder.name == TELEMETRY and bool(frames) and list_segment_files(folder) == [original.path]
 
 
-def _salvage_beside(part: _Original) -> Salvaged:
+def _salvage_unfinished_pair(part: _Original) -> Salvaged:
     """An unfinished segment whose finished one is there, too, and sound: whichever holds all the messages of both."""
     with part.finished.open("rb") as file:
         source = Source(file.fileno())
-        found = survey(source)
-        finished = _Original(part.finished, part.finished, source, found, opening_of(part.finished, found))
-        ours, theirs = _digests(part), _digests(finished)
+        found = scan_segment(source)
+        finished = _Original(part.finished, part.finished, source, found, find_opening(part.finished, found))
+        ours, theirs = _count_digests(part), _count_digests(finished)
     if ours <= theirs:
         return _settle(part, part.finished)
     if theirs < ours:
-        with _copy_of(part) as copy:
+        with _make_copy(part) as copy:
             return _settle(part, part.finished, copy)
     missing = (ours - theirs).total()
     kept = _keep(part)
@@ -404,7 +411,7 @@ def _salvage_beside(part: _Original) -> Salvaged:
     return Salvaged(part.path, part.finished, ours.total() - missing, part.found.lost_bytes, reason, kept)
 
 
-def _digests(original: _Original) -> Counter[bytes]:
+def _count_digests(original: _Original) -> Counter[bytes]:
     """The messages, small and comparable."""
     digests: Counter[bytes] = Counter()
     for channel, message in original.messages():
@@ -414,13 +421,13 @@ def _digests(original: _Original) -> Counter[bytes]:
 
 
 @contextmanager
-def _copy_of(original: _Original) -> Generator[Path]:
+def _make_copy(original: _Original) -> Generator[Path]:
     """All that can be delivered, finished and on the disk as NNNN.mcap.tmp; it is locked until the block ends, and
     removed again when the disk refuses."""
     copy = original.finished.with_name(original.finished.name.replace(FINISHED, TEMPORARY))
     with suppress(OSError):
         os.truncate(original.path, original.source.size)  # gives back what a dead recorder had reserved behind its end
-    with _new_file(copy) as file:
+    with _create_file(copy) as file:
         try:
             _write(file, original)
             file.flush()
@@ -432,7 +439,7 @@ def _copy_of(original: _Original) -> Generator[Path]:
             raise
 
 
-def _new_file(path: Path) -> BinaryIO:
+def _create_file(path: Path) -> BinaryIO:
     """A file that was not there, locked. Another repair may take it for left over until it is: then there is another
     one; FileExistsError when that is another's."""
     while True:
@@ -449,7 +456,7 @@ def _write(file: BinaryIO, original: _Original) -> None:
     writer = McapWriter(CompressionType.ZSTD, CHUNK_BYTES, LEVELS[series])
     table = FrameTable(writer)
     channels = _write_opening(writer, table, original)
-    for messages in original.chunks():
+    for messages in original.iterate_chunks():
         for channel, message in messages:
             number = channels[channel.id]
             writer.add_message(number, message.log_time_ns, message.publish_time_ns, message.sequence, message.data)
@@ -471,9 +478,9 @@ def _write_opening(writer: McapWriter, table: FrameTable, original: _Original) -
         writer.add_attachment(attachment)
     number = int(original.finished.name.partition(".")[0])
     writer.add_metadata(SESSION_METADATA, dict(opening.session))
-    place = segment_metadata(original.path.parent.name, number, opening.session)
+    place = make_segment_metadata(original.path.parent.name, number, opening.session)
     writer.add_metadata(SEGMENT_METADATA, place)
-    writer.add_metadata(SALVAGE_METADATA, _salvage_metadata(original))
+    writer.add_metadata(SALVAGE_METADATA, _make_salvage_metadata(original))
     schemas = {
         schema.id: writer.add_schema(schema.name, schema.encoding, schema.data)
         for _, schema in sorted(opening.schemas.items())
@@ -488,24 +495,24 @@ def _write_opening(writer: McapWriter, table: FrameTable, original: _Original) -
     return channels
 
 
-def _salvage_metadata(original: _Original) -> dict[str, str]:
+def _make_salvage_metadata(original: _Original) -> dict[str, str]:
     return {
         "source": original.path.name,
-        "reason": _reason(original),
+        "reason": _explain(original),
         "messages": str(original.delivered),
         "lost_bytes": str(original.found.lost_bytes),
         "damaged_places": str(len(original.found.damages)),
     }
 
 
-def _reason(original: _Original) -> str:
+def _explain(original: _Original) -> str:
     found = original.found
     reasons: list[str] = []
     if found.damages:
         places = "1 damaged place" if len(found.damages) == 1 else f"{len(found.damages)} damaged places"
         reasons.append(f"{places} of {found.lost_bytes} bytes, the first at byte {found.damages[0].begin}")
-    if found.torn_bytes:
-        reasons.append(f"a block of {found.torn_bytes} bytes was being written at its end")
+    if found.partial_write_bytes:
+        reasons.append(f"a block of {found.partial_write_bytes} bytes was being written at its end")
     if found.is_session_wrong:
         reasons.append("its metadata do not fit their CRC")
     if original.opening is None:
@@ -521,14 +528,14 @@ def _settle(original: _Original, path: Path | None, copy: Path | None = None) ->
     """Put the copy, if there is one, in its place and the original out of the way. Each step leaves a state from
     which a repair can continue."""
     folder = original.path.parent
-    kept = None if original.is_all_there else _keep(original)
+    kept = None if original.is_complete else _keep(original)
     if copy is not None:
         os.replace(copy, original.finished)
         sync_folder(folder)
     if original.path != path:
         original.path.unlink()
         sync_folder(folder)
-    return Salvaged(original.path, path, original.delivered, original.found.lost_bytes, _reason(original), kept)
+    return Salvaged(original.path, path, original.delivered, original.found.lost_bytes, _explain(original), kept)
 
 
 def _keep(original: _Original) -> Path:
@@ -545,7 +552,7 @@ def _keep(original: _Original) -> Path:
     raise ValueError("counting ends")
 
 
-def salvage_line(salvaged: Salvaged) -> str:
+def format_salvaged(salvaged: Salvaged) -> str:
     """What became of a segment, which is named with its session."""
     source = "/".join(salvaged.source.absolute().parts[-3:])
     if salvaged.reason == BEING_RECORDED:

@@ -1,4 +1,4 @@
-"""The process that touches the disk for a daemon, see foundation/helper.py.
+"""The process that touches the disk for a daemon, see foundation/worker_process.py.
 
 A thread that waits for a disk in the kernel cannot be killed, and keeps its whole process from ending. So a daemon that
 has to leave while the disk hangs leaves this process behind. Until that has ended it holds its locks, which show that a
@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.helper import Helper
+from thermostand.foundation.worker_process import WorkerProcess
+from thermostand.foundation.workers import WorkerThread
 
 MODULE = "thermostand.recording.writing.disk"
 LEFT_NAME = "stand-disk-left"  # of a process whose daemon has gone
@@ -24,7 +24,7 @@ LATCH_LINE = "latch"  # which waits for nothing else
 _LINES = (FRAMES_LINE, TELEMETRY_LINE, JOURNAL_LINE, FILES_LINE, QUEUE_LINE, NOTES_LINE, REPAIR_LINE, LATCH_LINE)
 
 
-class DiskProcess(Helper):
+class DiskProcess(WorkerProcess):
     """The process, with a line for each file that may hang by itself."""
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class DiskCalls:
 
     def __init__(self, disk: DiskProcess | None, line: str, clock: Clock) -> None:
         self._line = None if disk is None else disk.line(line)
-        self._lane = Lane(f"disk-{line}", clock, patient=False)
+        self._lane = WorkerThread(f"disk-{line}", clock, patient=False)
 
     async def call(self, function: Callable[..., Any], *args: object) -> Any:
         """What `function(*args)` returns or raises, which can be pickled; SessionError when the process is gone, and

@@ -12,26 +12,26 @@ from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
 
-from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
+from thermostand.foundation.workers import WorkerThread
+from thermostand.recording.format.capture_restarts import find_restarted_step
 from thermostand.recording.format.images import (
-    Circumstances,
+    FrameContext,
     encode_image,
     encode_meta,
-    frame_topics,
-    last_readings,
+    name_frame_topics,
+    select_frame_readings,
 )
 from thermostand.recording.format.layout import FRAMES, SEQUENCE_MASK
 from thermostand.recording.format.messages import decode_frame_meta
-from thermostand.recording.format.restarts import restarted_step
-from thermostand.recording.writing.homes import FolderContents, FolderLost, Homes
-from thermostand.recording.writing.notices import Losses
+from thermostand.recording.writing.folder_watch import FolderContents, FolderLost, FolderWatch
+from thermostand.recording.writing.notices import FrameLosses
+from thermostand.recording.writing.pending_items import PendingItems
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import MessageRecord
 from thermostand.recording.writing.series import DiskSeries
-from thermostand.recording.writing.waiting import Waiting
 
 _OPENING_BYTES = 100_000  # more than what stands before the first frame of a segment
 
@@ -40,17 +40,17 @@ class PublishedFrame(NamedTuple):
     """A frame, and what was known then."""
 
     frame: Frame
-    known: Circumstances
+    known: FrameContext
 
 
-def frame_records(published: PublishedFrame) -> list[MessageRecord]:
+def encode_frame(published: PublishedFrame) -> list[MessageRecord]:
     """The two messages of a frame; one that was recorded before keeps its description. ValueError when its image is
     none, or a window is not within it."""
     frame, published_ns = published.frame, published.known.published_ns
     description = frame.described or encode_meta(frame, published.known)
     if frame.described:
         published_ns = decode_frame_meta(description).published_ns
-    meta, image = frame_topics(frame.channel)
+    meta, image = name_frame_topics(frame.channel)
     stamps = frame.block_id & SEQUENCE_MASK, published_ns
     return [
         MessageRecord(meta, frame.time_ns, description, *stamps),
@@ -68,17 +68,19 @@ class StandSnapshot:
     def receive(self, item: Item) -> None:
         """One more item of the hub."""
         if isinstance(item, Batch):
-            self._readings |= {f"{reading.channel} {reading.unit}": reading for reading in last_readings(item.readings)}
+            self._readings |= {
+                f"{reading.channel} {reading.unit}": reading for reading in select_frame_readings(item.readings)
+            }
         elif isinstance(item, StepMark) and item.state is StepState.STARTED:
             self._steps = {item.step_id: item}
 
-    def of(self, frame: Frame, now_ns: int) -> Circumstances:
+    def of(self, frame: Frame, now_ns: int) -> FrameContext:
         """Of a frame that is published now."""
         mark = self._steps.get(frame.step_id)
         parameters = {} if mark is None else mark.parameters
         degC = parameters.get("chamber_degC")
         set_point_degC = float(degC) if isinstance(degC, int | float) else math.nan
-        return Circumstances(
+        return FrameContext(
             now_ns,
             str(parameters.get("role") or ""),
             set_point_degC,
@@ -86,7 +88,7 @@ class StandSnapshot:
         )
 
 
-class Frames:
+class FrameRecorder:
     """The frames of one session; `receive` is the hub's subscriber from `begin` on. kept: what their folder holds of
     this run. `prepare` gives what of a frame is recorded, in a thread of its own and in order of the frames."""
 
@@ -95,23 +97,23 @@ class Frames:
         settings: RecordingSettings,
         prepare: Callable[[Frame], Frame] | None,
         clock: Clock,
-        waiting: Waiting,
-        homes: Homes,
+        waiting: PendingItems,
+        homes: FolderWatch,
     ) -> None:
-        self._prepare = prepare or _as_it_is
+        self._prepare = prepare or _keep_frame
         self._surroundings = StandSnapshot()
         self._clock = clock
         self._waiting = waiting
         self._homes = homes
         self._queue: asyncio.Queue[PublishedFrame] = asyncio.Queue(settings.queue_frames)
         self._taking = False
-        self.losses = Losses()
+        self.losses = FrameLosses()
         self.taken = 0
 
     def begin(self, series: DiskSeries) -> None:
         """Take what is published, into this series."""
         self.series = series
-        self.lane = Lane("record-frames", self._clock, patient=False)
+        self.lane = WorkerThread("record-frames", self._clock, patient=False)
         self._writer = FrameWriter(series, self._prepare, self.losses)
         self.kept = FolderContents(self._clock.now_ns(), 0)
         self._taking = True
@@ -136,7 +138,7 @@ class Frames:
         if not self._taking:
             return
         self._surroundings.receive(item)
-        if isinstance(item, Event) and (step_id := restarted_step(item)):
+        if isinstance(item, Event) and (step_id := find_restarted_step(item)):
             self.losses.supersede(step_id, item.time_ns)
         if isinstance(item, Frame):
             now_ns = self._clock.now_ns()
@@ -152,16 +154,16 @@ class Frames:
     async def record(self) -> None:
         """One after the other, until cancelled."""
         while True:
-            await self._homes.there.wait()
+            await self._homes.frames_folder_present.wait()
             frame = self._writer.homeless or await self._queue.get()
             fate, reason = await self.lane.call(self._writer.save, frame)
-            if fate is Fate.HOMELESS:
+            if fate is FrameOutcome.HOMELESS:
                 self._homes.follow(FRAMES, reason, self.kept)
                 continue
             published_ns = self._waiting.frame_done()
-            if fate is Fate.REFUSED:
+            if fate is FrameOutcome.REFUSED:
                 self._waiting.frame_refused(published_ns)
-            elif fate is Fate.SAVED:
+            elif fate is FrameOutcome.SAVED:
                 self._waiting.frames_work()
                 self.kept = FolderContents(published_ns, self._writer.saved)
             self._waiting.changed()
@@ -181,13 +183,13 @@ class Frames:
         while frame is not None or not self._queue.empty():
             frame = frame or self._queue.get_nowait()
             fate, reason = await self.lane.call(self._writer.save, frame)
-            if fate is Fate.HOMELESS:
+            if fate is FrameOutcome.HOMELESS:
                 self._writer.give_up(frame, reason)
             frame = None
         self._taking = False
 
 
-class Fate(Enum):
+class FrameOutcome(Enum):
     """What became of a frame. LOST: for a reason that is not the disk's, or on a nearly full one, which is reported by
     itself. REFUSED: lost because the disk refuses it. HOMELESS: its folder is gone, and it may be saved later."""
 
@@ -197,14 +199,14 @@ class Fate(Enum):
     HOMELESS = "homeless"
 
 
-def _as_it_is(frame: Frame) -> Frame:
+def _keep_frame(frame: Frame) -> Frame:
     return frame
 
 
 class FrameWriter:
     """Encodes and commits frames one by one. `done` frames are `saved` or counted as lost."""
 
-    def __init__(self, series: DiskSeries, prepare: Callable[[Frame], Frame], losses: Losses) -> None:
+    def __init__(self, series: DiskSeries, prepare: Callable[[Frame], Frame], losses: FrameLosses) -> None:
         self._series = series
         self._prepare = prepare
         self._losses = losses
@@ -213,14 +215,14 @@ class FrameWriter:
         self.saved = 0
         self.done = 0
 
-    def save(self, published: PublishedFrame) -> tuple[Fate, str]:
+    def save(self, published: PublishedFrame) -> tuple[FrameOutcome, str]:
         """The frame on the disk; or why it is not, and it is counted as lost: the disk refuses it twice, it is nearly
         full, or the frame cannot be encoded. One whose folder is gone is not lost."""
-        fate, reason = self._fate(published)
-        self.homeless = published if fate is Fate.HOMELESS else None
+        fate, reason = self._try_save(published)
+        self.homeless = published if fate is FrameOutcome.HOMELESS else None
         if self.homeless is not None:
             return fate, reason
-        if fate is Fate.SAVED:
+        if fate is FrameOutcome.SAVED:
             self.saved += 1
         else:
             self._losses.count(published.frame, reason)
@@ -233,7 +235,7 @@ class FrameWriter:
         self._losses.count(published.frame, reason)
         self.done += 1
 
-    def _fate(self, published: PublishedFrame) -> tuple[Fate, str]:
+    def _try_save(self, published: PublishedFrame) -> tuple[FrameOutcome, str]:
         frame = published.frame
         try:
             self._series.finish_full(frame.time_ns)
@@ -241,17 +243,17 @@ class FrameWriter:
                 self._series.check_space()
             if (space := self._series.space.last).frames_stopped:
                 self._series.finish()  # for as long as that takes nothing is left open, or reserved
-                return Fate.LOST, space.stop_reason
-            records = frame_records(published._replace(frame=self._prepare(frame)))
+                return FrameOutcome.LOST, space.stop_reason
+            records = encode_frame(published._replace(frame=self._prepare(frame)))
             self._block_bytes = sum(len(record.data) for record in records)
             self._series.commit(records, frame.time_ns)
         except FolderLost as error:
-            return Fate.HOMELESS, str(error.strerror)
+            return FrameOutcome.HOMELESS, str(error.strerror)
         except OSError as error:
-            return Fate.REFUSED, str(error)
+            return FrameOutcome.REFUSED, str(error)
         except Exception as error:  # noqa: BLE001 - an encoder that fails on one frame must not end the run
-            return Fate.LOST, f"{type(error).__name__}: {error}"
-        return Fate.SAVED, ""
+            return FrameOutcome.LOST, f"{type(error).__name__}: {error}"
+        return FrameOutcome.SAVED, ""
 
     def tend(self, now_ns: int, refused: bool) -> OSError | None:
         """Without a frame: close the segment when it is old, and say whether frames could be written; `refused`: the

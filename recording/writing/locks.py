@@ -27,22 +27,22 @@ def lock(fd: int) -> None:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            pid = holder(fd) or pid
+            pid = find_holder(fd) or pid
             if not _may_end(pid) or time.monotonic() > deadline_s:
-                raise BlockingIOError(error.errno, _who(pid)) from None
+                raise BlockingIOError(error.errno, _describe_holder(pid)) from None
             time.sleep(_AGAIN_S)  # noqa: TID251 - as above
         else:
             return
 
 
-def holder(fd: int) -> int:
+def find_holder(fd: int) -> int:
     """The process that has locked this file, 0 when it is unknown: the kernel lists its locks page by page, and
     leaves some out when others come and go meanwhile."""
     found = os.fstat(fd)
-    return _listed(Path("/proc/locks").read_text(), found.st_dev, found.st_ino)
+    return _find_in_list(Path("/proc/locks").read_text(), found.st_dev, found.st_ino)
 
 
-def _listed(locks: str, device: int, inode: int) -> int:
+def _find_in_list(locks: str, device: int, inode: int) -> int:
     """The process that has locked this file, 0 when the kernel's list does not have it."""
     lines = (line.split() for line in locks.splitlines())
     pids = {fields[5]: int(fields[4]) for fields in lines if fields[1] == "FLOCK"}
@@ -56,12 +56,12 @@ def _listed(locks: str, device: int, inode: int) -> int:
 
 def _may_end(pid: int) -> bool:
     """Whether the holder is no daemon and none's: a disk process that was left behind, or one that is just ending."""
-    return _is_left(pid) or not _command(pid)
+    return _is_orphan(pid) or not _read_command(pid)
 
 
-def _is_left(pid: int) -> bool:
+def _is_orphan(pid: int) -> bool:
     """Whether this is a disk process whose daemon has gone."""
-    command = _command(pid)
+    command = _read_command(pid)
     if MODULE.encode() not in command:
         return False
     try:
@@ -71,7 +71,7 @@ def _is_left(pid: int) -> bool:
     return command[command.index(MODULE.encode()) + 1] != parent.encode()
 
 
-def _command(pid: int) -> list[bytes]:
+def _read_command(pid: int) -> list[bytes]:
     """Empty for a process that has ended, or is ending."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[:-1]
@@ -79,7 +79,7 @@ def _command(pid: int) -> list[bytes]:
         return []
 
 
-def _who(pid: int) -> str:
-    if _is_left(pid):
+def _describe_holder(pid: int) -> str:
+    if _is_orphan(pid):
         return f"its daemon has ended, but process {pid} still waits for the disk; try again when the disk answers"
     return "a daemon is running this session already"

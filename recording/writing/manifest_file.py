@@ -16,16 +16,16 @@ from threading import Lock
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import replace_file
-from thermostand.recording.format.damage import reading
-from thermostand.recording.format.inventory import SegmentFile, SegmentState, inventory
-from thermostand.recording.format.journal_lines import JOURNAL_NAME, text_hash
+from thermostand.recording.format.damage import convert_damage
+from thermostand.recording.format.inventory import SegmentFile, SegmentState, list_segments
+from thermostand.recording.format.journal_lines import JOURNAL_NAME, hash_text
 from thermostand.recording.format.layout import UNFINISHED
 from thermostand.recording.format.manifest import (
     MANIFEST_NAME,
     Manifest,
     NoManifest,
     Sealed,
-    journal_so_far,
+    digest_journal,
     read_manifest,
 )
 from thermostand.recording.format.records import Head, read_head
@@ -43,17 +43,17 @@ class ManifestFile:
         before = read_manifest(directory)
         if isinstance(before, Manifest) and dict(before.session) == dict(begun.session):
             begun = replace(before, devices={**before.devices, **begun.devices}, ended=False, journal=None)
-        elif _finished(directory):
+        elif _list_finished(directory):
             begun = replace(begun, remade=True)
-        self._manifest = _with_segments(directory, begun)
+        self._manifest = _add_segments(directory, begun)
         self._changing, self._writing = Lock(), Lock()
         self._is_new = False
-        replace_file(directory / MANIFEST_NAME, self._manifest.encoded())
+        replace_file(directory / MANIFEST_NAME, self._manifest.encode())
 
     def seal(self, name: str, sealed: Sealed) -> None:
         """A segment has been finished."""
         with self._changing:
-            self._manifest, self._is_new = self._manifest.with_segment(name, sealed), True
+            self._manifest, self._is_new = self._manifest.add_segment(name, sealed), True
         self._write()
 
     def plan(self, size: Mapping[str, int]) -> None:
@@ -68,7 +68,7 @@ class ManifestFile:
             if any(self._directory.glob(f"*/*{UNFINISHED}")):
                 return
             journal = self._directory / JOURNAL_NAME
-            so_far = journal_so_far(journal.read_bytes()) if journal.is_file() else None
+            so_far = digest_journal(journal.read_bytes()) if journal.is_file() else None
             with self._changing:
                 self._manifest, self._is_new = replace(self._manifest, ended=True, journal=so_far), True
             self._write()
@@ -80,7 +80,7 @@ class ManifestFile:
                 with self._changing:
                     manifest, self._is_new = self._manifest, False
                 if self._directory.is_dir():  # one that was removed is not made again unasked
-                    replace_file(self._directory / MANIFEST_NAME, manifest.encoded())
+                    replace_file(self._directory / MANIFEST_NAME, manifest.encode())
             except OSError:
                 return
             finally:
@@ -98,15 +98,15 @@ def complete_manifest(directory: Path) -> str:
         if not before.is_newer:
             write_manifest(directory, remade=True)
         return "" if before.is_newer else before.text
-    if (made := _with_segments(directory, before)) != before:
-        replace_file(directory / MANIFEST_NAME, made.encoded())
+    if (made := _add_segments(directory, before)) != before:
+        replace_file(directory / MANIFEST_NAME, made.encode())
     return ""
 
 
 def write_manifest(directory: Path, *, remade: bool = False) -> None:
     """One of the finished segments that are there, and of nothing else; SessionError when none can be read, OSError
     when the disk refuses."""
-    files = _finished(directory)
+    files = _list_finished(directory)
     if not files:
         raise SessionError(f"{directory}: has no finished segment")
     heads: list[Head] = []
@@ -117,36 +117,36 @@ def write_manifest(directory: Path, *, remade: bool = False) -> None:
         raise SessionError(f"{directory}: no finished segment can be read")
     ((session, _),) = Counter(tuple(sorted(head.session.items())) for head in heads).most_common(1)
     head = next(head for head in heads if head.session == dict(session))
-    texts = {name: text_hash(text) for name, text in head.attachments.items()}
-    made = _with_segments(directory, Manifest(head.session, texts=texts, ended=True, remade=remade))
-    replace_file(directory / MANIFEST_NAME, made.encoded())
+    texts = {name: hash_text(text) for name, text in head.attachments.items()}
+    made = _add_segments(directory, Manifest(head.session, texts=texts, ended=True, remade=remade))
+    replace_file(directory / MANIFEST_NAME, made.encode())
 
 
-def _finished(directory: Path) -> list[SegmentFile]:
-    return [file for file in inventory(directory) if file.state is SegmentState.FINISHED]
+def _list_finished(directory: Path) -> list[SegmentFile]:
+    return [file for file in list_segments(directory) if file.state is SegmentState.FINISHED]
 
 
-def _with_segments(directory: Path, manifest: Manifest) -> Manifest:
+def _add_segments(directory: Path, manifest: Manifest) -> Manifest:
     """With the finished segments of the session that are not listed yet: those of the last moments before a kill, and
     those that a repair has made. One that cannot be read, or is another session's, is left out."""
-    for file in _finished(directory):
+    for file in _list_finished(directory):
         with suppress(SessionError):
             head = read_head(file.path)
-            is_new = file.name not in manifest.segments or (head.salvaged and _is_other(file, manifest))
+            is_new = file.name not in manifest.segments or (head.salvaged and _is_other_session(file, manifest))
             if is_new and dict(head.session) == dict(manifest.session):
-                manifest = manifest.with_segment(file.name, sealed_of(file.path))
+                manifest = manifest.add_segment(file.name, seal_segment(file.path))
     return manifest
 
 
-def _is_other(file: SegmentFile, manifest: Manifest) -> bool:
+def _is_other_session(file: SegmentFile, manifest: Manifest) -> bool:
     known = manifest.segments[file.name]
-    return file.size_bytes != known.size_bytes or sealed_of(file.path) != known
+    return file.size_bytes != known.size_bytes or seal_segment(file.path) != known
 
 
-def sealed_of(path: Path) -> Sealed:
+def seal_segment(path: Path) -> Sealed:
     """A finished segment as it is; SessionError when it cannot be read."""
     digest, size_bytes = hashlib.sha256(), 0
-    with reading(path), path.open("rb") as file:
+    with convert_damage(path), path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):
             digest.update(block)
             size_bytes += len(block)

@@ -33,7 +33,7 @@ from mcap.records import (
 )
 from mcap.writer import LIBRARY_IDENTIFIER, MCAP0_MAGIC, CompressionType
 
-from thermostand.recording.format.mcap_bytes import CHUNK, CRC, LENGTH, MESSAGE, RECORD, bytes_of
+from thermostand.recording.format.mcap_bytes import CHUNK, CRC, LENGTH, MESSAGE, RECORD, encode_record
 
 _MESSAGE = int(Opcode.MESSAGE)
 # Tested against mcap's own writer, byte for byte: of 11 to 15 ms for a raw frame more than half were its three copies.
@@ -78,7 +78,7 @@ class McapWriter:
         self._first_ns = self._last_ns = 0
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._write(MCAP0_MAGIC)
-        self._write(bytes_of(Header("", LIBRARY_IDENTIFIER)))
+        self._write(encode_record(Header("", LIBRARY_IDENTIFIER)))
 
     def take(self) -> list[bytes | memoryview]:
         """The parts since the last time, one behind the other; the chunk in progress is not among them."""
@@ -87,7 +87,7 @@ class McapWriter:
 
     def add_attachment(self, attachment: Attachment) -> None:
         """In front of the chunk in progress."""
-        begin, length = self._write(bytes_of(attachment))
+        begin, length = self._write(encode_record(attachment))
         self._attachment_indexes.append(
             AttachmentIndex(
                 offset=begin,
@@ -102,13 +102,13 @@ class McapWriter:
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """In front of the chunk in progress."""
-        begin, length = self._write(bytes_of(Metadata(name=name, metadata=dict(entries))))
+        begin, length = self._write(encode_record(Metadata(name=name, metadata=dict(entries))))
         self._metadata_indexes.append(MetadataIndex(offset=begin, length=length, name=name))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Its number."""
         self._schemas.append(Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data))
-        self._add(bytes_of(self._schemas[-1]))
+        self._add(encode_record(self._schemas[-1]))
         return len(self._schemas)
 
     def add_channel(self, topic: str, encoding: str, schema: int, entries: Mapping[str, str]) -> int:
@@ -117,7 +117,7 @@ class McapWriter:
         self._channels.append(
             Channel(id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata=dict(entries))
         )
-        self._add(bytes_of(self._channels[-1]))
+        self._add(encode_record(self._channels[-1]))
         return number
 
     def add_message(
@@ -149,7 +149,7 @@ class McapWriter:
         begin, length = self._write(RECORD.pack(Opcode.CHUNK, len(head) + stored_bytes) + head, *parts)
         places: dict[int, int] = {}
         for channel, entries in chunk.places.items():
-            places[channel], _ = self._write(_message_index(channel, entries))
+            places[channel], _ = self._write(_encode_message_index(channel, entries))
         self._chunk_indexes.append(
             ChunkIndex(
                 chunk_length=length,
@@ -169,7 +169,7 @@ class McapWriter:
         if not self._is_ended:
             self._is_ended = True
             self.end_chunk()
-            self._write(bytes_of(DataEnd(0)))
+            self._write(encode_record(DataEnd(0)))
 
     def finish(self) -> None:
         """The index, behind the end of the data."""
@@ -177,7 +177,7 @@ class McapWriter:
         begin = self._written_bytes
         summary = RecordBuilder()
         offsets: list[SummaryOffset] = []
-        for opcode, group in self._groups():
+        for opcode, group in self._build_groups():
             start = summary.count
             for record in group:
                 record.write(summary)
@@ -186,10 +186,12 @@ class McapWriter:
         for offset in offsets:
             offset.write(summary)
         content = summary.end()
-        footer = bytes_of(Footer(summary_start=begin, summary_offset_start=offsets_begin, summary_crc=0))[: -CRC.size]
+        footer = encode_record(Footer(summary_start=begin, summary_offset_start=offsets_begin, summary_crc=0))[
+            : -CRC.size
+        ]
         self._write(content, footer, CRC.pack(zlib.crc32(footer, zlib.crc32(content))), MCAP0_MAGIC)
 
-    def _groups(self) -> list[tuple[Opcode, list[McapRecord]]]:
+    def _build_groups(self) -> list[tuple[Opcode, list[McapRecord]]]:
         statistics = Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
@@ -225,7 +227,7 @@ class McapWriter:
         return begin, self._written_bytes - begin
 
 
-def _message_index(channel: int, places: list[tuple[int, int]]) -> bytes:
+def _encode_message_index(channel: int, places: list[tuple[int, int]]) -> bytes:
     """The record that says where in its chunk the messages of a channel are, by their log times."""
     entries = pack(f"<HI{2 * len(places)}Q", channel, 16 * len(places), *chain.from_iterable(places))
     return RECORD.pack(Opcode.MESSAGE_INDEX, len(entries)) + entries

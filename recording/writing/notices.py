@@ -30,7 +30,7 @@ class Space(NamedTuple):
     total_bytes: int
 
 
-def disk_space(folder: Path) -> Space:
+def read_disk_space(folder: Path) -> Space:
     """The space now; raises OSError."""
     found = os.statvfs(folder)
     return Space(found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize)
@@ -68,7 +68,7 @@ class SpaceWatch:
         with self._lock:
             reserved_bytes = self._reserved_bytes()  # first: a reserve given back meanwhile must not look like a loss
             try:
-                space = disk_space(self._folder)
+                space = read_disk_space(self._folder)
             except OSError:
                 return
             self.free_bytes = space.free_bytes
@@ -87,7 +87,7 @@ class SpaceWatch:
         self.frames_stopped = stopped
 
 
-class Losses:
+class FrameLosses:
     """What is lost; `count` is called from any thread, `take` from one."""
 
     def __init__(self) -> None:
@@ -123,12 +123,12 @@ class Losses:
             reason, step_id, block_id = self._new.popleft()
             reasons.setdefault(reason, {}).setdefault(step_id, []).append(block_id)
             self._reported += 1
-        return [self._notice(reason, steps) for reason, steps in reasons.items()]
+        return [self._make_notice(reason, steps) for reason, steps in reasons.items()]
 
-    def _notice(self, reason: str, steps: dict[str, list[int]]) -> Event:
-        blocks = [run for blocks in steps.values() for run in runs(blocks)]
+    def _make_notice(self, reason: str, steps: dict[str, list[int]]) -> Event:
+        blocks = [run for blocks in steps.values() for run in group_runs(blocks)]
         data = {"blocks": blocks, "steps": list(steps), "total": self._reported, "reason": reason}
-        return FRAMES_DROPPED.at(0, _by_step(steps), **data)
+        return FRAMES_DROPPED.at(0, _format_by_step(steps), **data)
 
 
 class DroppedReadings:
@@ -154,14 +154,14 @@ class DroppedReadings:
             self._readings = 0
 
 
-def _by_step(steps: dict[str, list[int]]) -> str:
+def _format_by_step(steps: dict[str, list[int]]) -> str:
     """`4 (blocks 12 to 14, 17 of step capture-1)`, with "and" between steps."""
     count = sum(len(blocks) for blocks in steps.values())
-    places = [f"{ranges(blocks)}{f' of step {step_id}' if step_id else ''}" for step_id, blocks in steps.items()]
+    places = [f"{format_ranges(blocks)}{f' of step {step_id}' if step_id else ''}" for step_id, blocks in steps.items()]
     return f"{count} ({' and '.join(places)})"
 
 
-def runs(blocks: Iterable[int]) -> list[list[int]]:
+def group_runs(blocks: Iterable[int]) -> list[list[int]]:
     """The first and the last of each run of neighbours, in the order given."""
     found: list[list[int]] = []
     for block in blocks:
@@ -172,9 +172,9 @@ def runs(blocks: Iterable[int]) -> list[list[int]]:
     return found
 
 
-def ranges(blocks: Iterable[int]) -> str:
+def format_ranges(blocks: Iterable[int]) -> str:
     """`block 3`, `blocks 12 to 14, 17`: every block id in the order given, neighbours as a range."""
-    found = runs(blocks)
+    found = group_runs(blocks)
     texts = [f"{first}" if first == last else f"{first} to {last}" for first, last in found]
     is_one = len(found) == 1 and found[0][0] == found[0][1]
     return f"block{'' if is_one else 's'} {', '.join(texts)}"

@@ -18,24 +18,24 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from thermostand.foundation.calls import Lane
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import SEGMENT_GIVEN_UP, TELL_PLAN, EventKind
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
-from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
+from thermostand.foundation.workers import WorkerThread
 from thermostand.recording.format.batches import RecordedDevice
 from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.writing.disk import DiskProcess
-from thermostand.recording.writing.forms import SessionForm
-from thermostand.recording.writing.frames import Frames
-from thermostand.recording.writing.homes import Beside, Homes
+from thermostand.recording.writing.folder_watch import CompanionFile, FolderWatch
+from thermostand.recording.writing.frames import FrameRecorder
+from thermostand.recording.writing.pending_items import PendingItems
 from thermostand.recording.writing.recorder_settings import USUAL, RecordingSettings
 from thermostand.recording.writing.series import DiskSeries, open_series
-from thermostand.recording.writing.telemetry import Telemetry
-from thermostand.recording.writing.waiting import Waiting
+from thermostand.recording.writing.session_spec import SessionSpec
+from thermostand.recording.writing.telemetry import TelemetryRecorder
 
 FINISH_WITHIN_S, COMPLETE_WITHIN_S = 2.0, 60.0  # real seconds that a disk may take for the end of a run: stopped, whole
 
@@ -72,16 +72,16 @@ class Recorder:
     ) -> None:
         self.directory = directory
         self.disk = disk
-        self._form = SessionForm(info.metadata(), dict(attachments), dict(devices), settings)
+        self._form = SessionSpec(info.metadata(), dict(attachments), dict(devices), settings)
         self._hub = hub
         self._clock = clock
         self._settings = settings
-        self._waiting = Waiting()
+        self._waiting = PendingItems()
         self._notices: deque[Event] = deque()  # from any thread
         tell = self._notices.append
-        self._homes = Homes(directory, tell)
-        self._frames = Frames(settings, prepare, clock, self._waiting, self._homes)
-        self._telemetry = Telemetry(
+        self._homes = FolderWatch(directory, tell)
+        self._frames = FrameRecorder(settings, prepare, clock, self._waiting, self._homes)
+        self._telemetry = TelemetryRecorder(
             directory, devices, settings=settings, clock=clock, waiting=self._waiting, homes=self._homes, tell=tell
         )
         self._receivers = self._frames.receive, self._telemetry.receive, self._receive_plan
@@ -93,7 +93,7 @@ class Recorder:
         """Frames published but not in the session."""
         return self._frames.losses.total
 
-    def lost_of(self, step_id: str) -> int:
+    def count_lost(self, step_id: str) -> int:
         """Frames of this step published but not in the session."""
         return self._frames.losses.of(step_id)
 
@@ -123,30 +123,30 @@ class Recorder:
         """As it was found at the last commit; does not wait for the disk."""
         return self._frames.series.space.last.free_bytes
 
-    def beside(self, file: Beside) -> None:
+    def watch_file(self, file: CompanionFile) -> None:
         """From now on this file counts as part of the session's folder: `folder_lost` and `refound` know of it."""
-        self._homes.beside.append(file)
+        self._homes.companions.append(file)
 
-    def refound(self) -> None:
+    def recover_folder(self) -> None:
         """An operator has reset the loss of the folder: continue in it, or in a new one at its place, with continued
         numbers. Returns at once."""
-        self._homes.refind()
+        self._homes.request_recovery()
 
     def start(self, earlier: Iterable[Item] = ()) -> None:
         """Make the folders, begin the telemetry and listen to the hub; SessionError when the disk refuses. `earlier`:
         what was published before, in its order, and belongs to the session."""
-        self._take(self._opened(), earlier)
+        self._take(self._open_series(), earlier)
 
     async def begin(self, earlier: Callable[[], Iterable[Item]]) -> None:
         """As `start`, off the loop."""
-        lane = Lane("record-begin", self._clock, patient=False)
+        lane = WorkerThread("record-begin", self._clock, patient=False)
         try:
-            series = await lane.call(self._opened)
+            series = await lane.call(self._open_series)
         finally:
             lane.close()
         self._take(series, earlier())
 
-    def _opened(self) -> tuple[DiskSeries, DiskSeries]:
+    def _open_series(self) -> tuple[DiskSeries, DiskSeries]:
         try:
             return open_series(self.disk, self.directory, self._form, self._clock.now_ns(), self._notices.append)
         except OSError as error:
@@ -171,9 +171,9 @@ class Recorder:
             tasks.create_task(self._on_ticks(self._save_telemetry))
             tasks.create_task(self._frames.record())
             tasks.create_task(self._on_ticks(self._frames.tend))
-            tasks.create_task(self._refound_when_asked())
+            tasks.create_task(self._recover_when_requested())
 
-    async def flushed(self) -> None:
+    async def flush(self) -> None:
         """Return when everything published before the call is on the disk or counted as lost. Only while `run` runs;
         telemetry the disk refuses is waited for."""
         frames, items = self._frames.taken, self._telemetry.items_taken
@@ -181,28 +181,28 @@ class Recorder:
         while self._telemetry.taking and (self._frames.done < frames or self._telemetry.items_saved < items):
             await self._waiting.change.wait()
 
-    async def finish(self, within_s: float = math.inf, patience: Patience | None = None) -> None:
+    async def finish(self, within_s: float = math.inf, deadline: ShutdownDeadline | None = None) -> None:
         """Put what still waits on the disk and complete the segments; SessionError when telemetry was not saved or its
         segment stays unfinished, or when the disk has not done all that within so many real seconds, or so long as
-        `patience` lasts: it is then left to itself. Items published later are not recorded. It runs to its end also
+        `deadline` lasts: it is then left to itself. Items published later are not recorded. It runs to its end also
         when the caller is cancelled. May be called twice."""
-        patience = patience or Patience()
+        deadline = deadline or ShutdownDeadline()
         if self._finishing is None:
             if not self._telemetry.taking:
                 return
             self._finishing = asyncio.ensure_future(self._finish())
         try:
-            await patience.wait(self._finishing, within_s)
+            await deadline.wait(self._finishing, within_s)
         except asyncio.CancelledError:
-            await patience.wait(self._finishing, within_s)
-            await self._left()
+            await deadline.wait(self._finishing, within_s)
+            await self._wait_for_finish()
             raise
-        await self._left()
+        await self._wait_for_finish()
         for receive in self._receivers:
             self._hub.unsubscribe(receive)
         await self._finishing
 
-    async def _left(self) -> None:
+    async def _wait_for_finish(self) -> None:
         """Wait for nothing any more that `_finish` has not done."""
         if self._finishing is not None and not self._finishing.done():
             self._telemetry.lane.abandon()
@@ -252,7 +252,7 @@ class Recorder:
         """At each instant at which the telemetry is committed."""
         due_ns = self._clock.now_ns()
         while True:
-            due_ns += seconds_ns(self._settings.telemetry_commit_s)
+            due_ns += to_ns(self._settings.telemetry_commit_s)
             await self._clock.sleep_until(due_ns)
             await work(due_ns)
 
@@ -264,16 +264,16 @@ class Recorder:
     async def _report_on_tick(self, _: int) -> None:
         self._report()
 
-    async def _refound_when_asked(self) -> None:
+    async def _recover_when_requested(self) -> None:
         """After `refound`: the folders are found or made again, and the loss is an event."""
         while True:
-            await self._homes.refinding.wait()
-            made_again = await self._homes.refound(
-                lambda: self._telemetry.lane.call(self._telemetry.series.refound),
-                lambda: self._frames.lane.call(self._frames.series.refound),
+            await self._homes.recovery_requested.wait()
+            made_again = await self._homes.recover(
+                lambda: self._telemetry.lane.call(self._telemetry.series.recover),
+                lambda: self._frames.lane.call(self._frames.series.recover),
             )
             if made_again:
-                self._notices.append(self._homes.loss(made_again, self._begun_ns))
+                self._notices.append(self._homes.make_loss_event(made_again, self._begun_ns))
             await self._telemetry.save()
             self._report()
 

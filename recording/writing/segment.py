@@ -42,13 +42,20 @@ from thermostand.recording.format.layout import (
     SESSION_METADATA,
     TEMPORARY,
     UNFINISHED,
-    segment_metadata,
+    make_segment_metadata,
 )
 from thermostand.recording.format.manifest import Sealed
-from thermostand.recording.format.mcap_bytes import MESSAGE, RECORD, check_attachment, chunk_content, records, stream
-from thermostand.recording.format.messages import frame_table
+from thermostand.recording.format.mcap_bytes import (
+    MESSAGE,
+    RECORD,
+    check_attachment,
+    decompress_chunk,
+    iterate_records,
+    make_stream,
+)
+from thermostand.recording.format.messages import encode_frame_table
 from thermostand.recording.writing.mcap_writer import McapWriter
-from thermostand.recording.writing.notices import disk_space
+from thermostand.recording.writing.notices import read_disk_space
 
 # A telemetry segment of ten minutes has 600 chunks of a second's commit each; merged it is read three times as fast.
 MANY_CHUNKS = 32  # opening a chunk takes a reader as long as a dozen messages
@@ -87,7 +94,7 @@ class Topic:
 
 
 @dataclass(frozen=True, slots=True)
-class SeriesForm:
+class SeriesSpec:
     """What every segment of a series has in common.
 
     A segment is full at `segment_bytes` or `segment_ns`. `reserve_bytes` of the disk are allocated when it is opened,
@@ -151,7 +158,7 @@ class CommitSink:
             raise
         self.committed_bytes = end_bytes
 
-    def sealed(self, messages: Mapping[str, int]) -> Sealed:
+    def seal(self, messages: Mapping[str, int]) -> Sealed:
         """What has been committed, as a whole file."""
         return Sealed(self.committed_bytes, self._sha256.hexdigest(), dict(messages))
 
@@ -192,14 +199,14 @@ class FrameTable:
         """The table, when there is a frame: nothing is added any more."""
         if self._descriptions:
             self._writer.end_chunk()
-            table = frame_table(self._descriptions)
+            table = encode_frame_table(self._descriptions)
             self._writer.add_attachment(Attachment(0, time_ns, FRAME_TABLE, "application/x-protobuf", table))
 
 
 class Segment:
     """One file of a series, from creation to finish; after an OSError of any method only `abandon` is left."""
 
-    def __init__(self, folder: Path, number: int, form: SeriesForm, time_ns: int) -> None:
+    def __init__(self, folder: Path, number: int, form: SeriesSpec, time_ns: int) -> None:
         self.begun_ns = time_ns
         self.number = number
         self._form = form
@@ -210,7 +217,7 @@ class Segment:
         self._table = FrameTable(self._writer)
         self._chunk_count = 0
         self._messages: Counter[str] = Counter()  # by topic
-        self._sink = CommitSink(self._part, _affordable_bytes(folder, form))
+        self._sink = CommitSink(self._part, _compute_affordable_bytes(folder, form))
         try:
             sync_folder(folder)
             self._channels = self._begin(number)
@@ -227,7 +234,7 @@ class Segment:
             self._writer.add_attachment(Attachment(0, self.begun_ns, name, media_type, text.encode()))
         session = self._form.session
         self._writer.add_metadata(SESSION_METADATA, session)
-        self._writer.add_metadata(SEGMENT_METADATA, segment_metadata(self._form.name, number, session))
+        self._writer.add_metadata(SEGMENT_METADATA, make_segment_metadata(self._form.name, number, session))
         return {topic.name: self._register(topic) for topic in self._form.topics}
 
     def _register(self, topic: Topic) -> int:
@@ -240,7 +247,7 @@ class Segment:
         self._table.know(channel, name)
         return channel
 
-    def _late(self, name: str) -> int:
+    def _add_late_topic(self, name: str) -> int:
         """A topic that is first written to now; KeyError when the series has none of that name."""
         if self._form.topic_of is None:
             raise KeyError(name)
@@ -252,7 +259,7 @@ class Segment:
             time_ns, published_ns = record.time_ns, record.published_ns or record.time_ns
             channel = self._channels.get(record.topic)
             if channel is None:
-                channel = self._channels[record.topic] = self._late(record.topic)
+                channel = self._channels[record.topic] = self._add_late_topic(record.topic)
             self._writer.add_message(channel, time_ns, published_ns, record.sequence, record.data)
             self._table.note(channel, record.data)
             self._messages[record.topic] += 1
@@ -289,15 +296,15 @@ class Segment:
         self._writer.finish()
         self._sink.append(self._writer.take())
         self._sink.settle()
-        sealed = self._merged() if self._form.merge_chunks and self._chunk_count >= MANY_CHUNKS else None
+        sealed = self._merge() if self._form.merge_chunks and self._chunk_count >= MANY_CHUNKS else None
         if sealed is None:
             os.replace(self._part, self._finished)
             sync_folder(self._part.parent)
-            sealed = self._sink.sealed(self._messages)
+            sealed = self._sink.seal(self._messages)
         self._sink.close()
         return sealed
 
-    def _merged(self) -> Sealed | None:
+    def _merge(self) -> Sealed | None:
         """The finished segment when it is now the copy with large chunks; None when the disk has no room for it, or
         gives back other bytes than it took: the file stays as it was committed."""
         try:
@@ -327,11 +334,11 @@ class Segment:
         self.close()
 
 
-def _affordable_bytes(folder: Path, form: SeriesForm) -> int:
+def _compute_affordable_bytes(folder: Path, form: SeriesSpec) -> int:
     """What a segment may reserve here and now."""
     if not form.reserve_bytes:
         return 0
-    spare_bytes = disk_space(folder).free_bytes - max(form.keep_free_bytes, FILE_SYSTEM_BYTES)
+    spare_bytes = read_disk_space(folder).free_bytes - max(form.keep_free_bytes, FILE_SYSTEM_BYTES)
     return min(form.reserve_bytes, max(0, spare_bytes))
 
 
@@ -360,7 +367,7 @@ def merge_chunks(source: Path, target: Path, compression: CompressionType) -> Se
     finally:
         sink.close()
     sync_folder(target.parent)
-    return sink.sealed({})
+    return sink.seal({})
 
 
 def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:
@@ -387,20 +394,20 @@ def _add(writer: McapWriter, opcode: int, content: memoryview) -> None:
         channel, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(content)
         writer.add_message(channel, log_time_ns, publish_time_ns, sequence, bytes(content[MESSAGE.size :]))
     elif opcode == Opcode.CHUNK:
-        for each in records(chunk_content(content)[1]):
+        for each in iterate_records(decompress_chunk(content)[1]):
             _add(writer, *each)
     elif opcode == Opcode.CHANNEL:
-        channel = Channel.read(stream(content))
+        channel = Channel.read(make_stream(content))
         writer.add_channel(channel.topic, channel.message_encoding, channel.schema_id, channel.metadata)
     elif opcode == Opcode.SCHEMA:
-        schema = Schema.read(stream(content))
+        schema = Schema.read(make_stream(content))
         writer.add_schema(schema.name, schema.encoding, schema.data)
     elif opcode == Opcode.METADATA:
-        metadata = Metadata.read(stream(content))
+        metadata = Metadata.read(make_stream(content))
         writer.add_metadata(metadata.name, metadata.metadata)
     elif opcode == Opcode.ATTACHMENT:
         check_attachment(bytes(content))
-        writer.add_attachment(Attachment.read(stream(content)))
+        writer.add_attachment(Attachment.read(make_stream(content)))
 
 
 def _reserve(fd: int, size_bytes: int) -> None:
@@ -416,7 +423,7 @@ def _reserve(fd: int, size_bytes: int) -> None:
 def _write(fd: int, parts: Sequence[bytes | memoryview], offset: int) -> int:
     """Write all parts, one behind the other, from `offset`; returns where they end. The disk begins with a piece while
     the next one is copied: a frame that is handed over at once waits for the copy of all of it first."""
-    for piece in _pieces(parts):
+    for piece in _split_into_pieces(parts):
         begin = offset
         while piece:  # a nearly full disk takes a part of the piece before it refuses
             written = os.pwritev(fd, piece, offset)
@@ -430,18 +437,18 @@ def _write(fd: int, parts: Sequence[bytes | memoryview], offset: int) -> int:
     return offset
 
 
-def _pieces(parts: Sequence[bytes | memoryview]) -> Iterator[list[memoryview]]:
+def _split_into_pieces(parts: Sequence[bytes | memoryview]) -> Iterator[list[memoryview]]:
     """The parts' bytes in their order, in pieces of at most _PIECE_BYTES and _PARTS_AT_ONCE parts."""
     piece: list[memoryview] = []
-    room = _PIECE_BYTES
+    left_bytes = _PIECE_BYTES
     for part in parts:
         rest = memoryview(part)
         while rest:
-            piece.append(rest[:room])
-            room -= len(piece[-1])
+            piece.append(rest[:left_bytes])
+            left_bytes -= len(piece[-1])
             rest = rest[len(piece[-1]) :]
-            if not room or len(piece) == _PARTS_AT_ONCE:
+            if not left_bytes or len(piece) == _PARTS_AT_ONCE:
                 yield piece
-                piece, room = [], _PIECE_BYTES
+                piece, left_bytes = [], _PIECE_BYTES
     if piece:
         yield piece

@@ -13,15 +13,15 @@ from typing import Any, NamedTuple, TypeVar
 
 from thermostand.foundation.files import make_durable_folder, sync_folder
 from thermostand.foundation.items import Event
-from thermostand.recording.format.inventory import foreign_numbers
+from thermostand.recording.format.inventory import find_foreign_numbers
 from thermostand.recording.format.layout import FRAMES, TELEMETRY, TEMPORARY
 from thermostand.recording.format.manifest import Sealed
 from thermostand.recording.writing.disk import FRAMES_LINE, TELEMETRY_LINE, DiskProcess
-from thermostand.recording.writing.forms import SessionForm
-from thermostand.recording.writing.homes import Home
+from thermostand.recording.writing.folder_watch import WatchedFolder
 from thermostand.recording.writing.manifest_file import ManifestFile
 from thermostand.recording.writing.notices import SpaceWatch
-from thermostand.recording.writing.segment import CommitSink, MessageRecord, Segment, SeriesForm
+from thermostand.recording.writing.segment import CommitSink, MessageRecord, Segment, SeriesSpec
+from thermostand.recording.writing.session_spec import SessionSpec
 
 Item = TypeVar("Item")
 
@@ -35,11 +35,11 @@ class Series:
     raises FolderLost.
     """
 
-    def __init__(self, folder: Path, form: SeriesForm, seal: Callable[[str, Sealed], None] | None = None) -> None:
+    def __init__(self, folder: Path, form: SeriesSpec, seal: Callable[[str, Sealed], None] | None = None) -> None:
         self._folder = folder
         self._form = form
-        self._seal = seal or _unlisted  # called with each finished segment
-        self._home = Home(folder)
+        self._seal = seal or _ignore_sealed  # called with each finished segment
+        self._home = WatchedFolder(folder)
         self._used = -1  # the highest number that a message was committed under; it is never used again
         self._segment: Segment | None = None
         self._failed: Segment | None = None  # given up, but not yet cut back to what was acknowledged
@@ -64,7 +64,7 @@ class Series:
         if self._segment is None:
             self._home.check()
             self._let_go()
-            number = max(next_number(self._folder), self._used + 1)
+            number = max(find_next_number(self._folder), self._used + 1)
             self._segment = Segment(self._folder, number, self._form, time_ns)
         return self._segment
 
@@ -120,10 +120,10 @@ class Series:
         finally:
             path.unlink(missing_ok=True)
 
-    def refound(self) -> bool:
+    def recover(self) -> bool:
         """After a FolderLost: whether the folder is back, and writing continues where it was; else one is made at its
         place, and the numbers continue. OSError when that cannot be done."""
-        if self._home.refound():
+        if self._home.recover():
             return True
         segment, self._segment = self._segment, None
         self._close(segment)
@@ -164,15 +164,15 @@ class Series:
                 segment.close()
 
 
-def _unlisted(name: str, sealed: Sealed) -> None:
+def _ignore_sealed(name: str, sealed: Sealed) -> None:
     """Of a series without a session around it."""
 
 
-def next_number(folder: Path) -> int:
+def find_next_number(folder: Path) -> int:
     """The number after the highest segment in `folder`, finished or not, damaged or half copied; 0 in an empty one. A
     file that was put there under a number far outside does not count."""
     numbers = [int(match[1]) for path in folder.iterdir() if (match := re.match(r"(\d{4,})\.mcap", path.name))]
-    return max(set(numbers) - foreign_numbers(numbers), default=-1) + 1
+    return max(set(numbers) - find_foreign_numbers(numbers), default=-1) + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,14 +198,14 @@ class SessionSeries:
     """Both series of a session, made or continued in `directory`, and the watch over their disk; the telemetry is
     begun. Blocking; raises OSError. Each series is used from one thread, the watch from both."""
 
-    def __init__(self, directory: Path, form: SessionForm, time_ns: int) -> None:
+    def __init__(self, directory: Path, form: SessionSpec, time_ns: int) -> None:
         for name in (FRAMES, TELEMETRY):
             make_durable_folder(directory / name)
         sync_folder(directory)
         sync_folder(directory.parent)
-        self._manifest = ManifestFile(directory, form.manifest())
+        self._manifest = ManifestFile(directory, form.make_manifest())
         frames = Series(directory / FRAMES, form.frames(), self._manifest.seal)
-        telemetry = Series(directory / TELEMETRY, form.telemetry(), self._manifest.seal)
+        telemetry = Series(directory / TELEMETRY, form.make_telemetry_spec(), self._manifest.seal)
         self._series = {FRAMES: frames, TELEMETRY: telemetry}
         self._notices: deque[Event] = deque()
         stop, alert = form.settings.stop_frames_below_bytes, form.settings.alert_below_fraction
@@ -219,7 +219,7 @@ class SessionSeries:
             result = getattr(series, method)(*args)
         except OSError as error:
             failure = error
-        return SeriesReply(result, failure, series.is_open, _taken(series.troubles))
+        return SeriesReply(result, failure, series.is_open, _drain(series.troubles))
 
     def plan(self, size: Mapping[str, int]) -> None:
         """How many `steps` and `frames` the plan has."""
@@ -233,10 +233,10 @@ class SessionSeries:
         """A look at the disk."""
         space = self._space
         space.check()
-        return SpaceFound(space.frames_stopped, space.stop_reason, space.free_bytes, _taken(self._notices))
+        return SpaceFound(space.frames_stopped, space.stop_reason, space.free_bytes, _drain(self._notices))
 
 
-def _taken(waiting: deque[Item]) -> tuple[Item, ...]:
+def _drain(waiting: deque[Item]) -> tuple[Item, ...]:
     """All that waits; more may come, and another thread take some, meanwhile."""
     taken: list[Item] = []
     with suppress(IndexError):
@@ -286,9 +286,9 @@ class DiskSeries:
         """OSError while the disk would refuse a block."""
         self._do("probe", size_bytes, time_ns)
 
-    def refound(self) -> bool:
+    def recover(self) -> bool:
         """Whether the folder is back."""
-        return bool(self._do("refound"))
+        return bool(self._do("recover"))
 
     def finish_full(self, time_ns: int) -> None:
         """Close a segment that has its size or age."""
@@ -329,14 +329,14 @@ class DiskSeries:
 
 
 def open_series(
-    disk: DiskProcess | None, directory: Path, form: SessionForm, time_ns: int, tell: Callable[[Event], None]
+    disk: DiskProcess | None, directory: Path, form: SessionSpec, time_ns: int, tell: Callable[[Event], None]
 ) -> tuple[DiskSeries, DiskSeries]:
     """Frames and telemetry of a session, made or continued; raises OSError. disk: the process that has them, None: this
     one."""
     space = DiskSpace(tell)
     if disk is None:
         both = SessionSeries(directory, form, time_ns)
-        asks: list[Callable[..., Any]] = [partial(_called, both)] * 2
+        asks: list[Callable[..., Any]] = [partial(_call_method, both)] * 2
     else:
         lines = disk.line(FRAMES_LINE), disk.line(TELEMETRY_LINE)
         lines[1].make(_KEPT, SessionSeries, directory.absolute(), form, time_ns)
@@ -344,5 +344,5 @@ def open_series(
     return DiskSeries(FRAMES, asks[0], space), DiskSeries(TELEMETRY, asks[1], space)
 
 
-def _called(series: SessionSeries, method: str, *args: object) -> Any:
+def _call_method(series: SessionSeries, method: str, *args: object) -> Any:
     return getattr(series, method)(*args)

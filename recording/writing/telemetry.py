@@ -9,27 +9,27 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import TELEMETRY_NOT_SAVED, TELEMETRY_SAVED_AGAIN
 from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame, Quality
+from thermostand.foundation.workers import WorkerThread
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import RecordedDevice, batch_form
+from thermostand.recording.format.batches import RecordedDevice, make_batch_schema
 from thermostand.recording.format.layout import TELEMETRY
-from thermostand.recording.writing.forms import stages_of
-from thermostand.recording.writing.homes import FolderContents, Homes
+from thermostand.recording.writing.folder_watch import FolderContents, FolderWatch
 from thermostand.recording.writing.notices import DroppedReadings
+from thermostand.recording.writing.pending_items import PendingItems
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import MessageRecord
 from thermostand.recording.writing.series import DiskSeries
-from thermostand.recording.writing.waiting import Waiting
+from thermostand.recording.writing.session_spec import stages_of
 
 PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
 
 
-class Telemetry:
+class TelemetryRecorder:
     """The telemetry of one session; `receive` is the hub's subscriber from `begin` on. taking: until the
     end of the recording. kept: what its folder holds of this run."""
 
@@ -40,8 +40,8 @@ class Telemetry:
         *,
         settings: RecordingSettings,
         clock: Clock,
-        waiting: Waiting,
-        homes: Homes,
+        waiting: PendingItems,
+        homes: FolderWatch,
         tell: Callable[[Event], None],
     ) -> None:
         self._directory = directory
@@ -59,7 +59,7 @@ class Telemetry:
     def begin(self, series: DiskSeries) -> None:
         """Take what is published, into this series."""
         self.series = series
-        self.lane = Lane("record-telemetry", self._clock, patient=False)
+        self.lane = WorkerThread("record-telemetry", self._clock, patient=False)
         self._writer = TelemetryWriter(series, self._encoder)
         self.kept = FolderContents(self._clock.now_ns(), 0)
         self.taking = True
@@ -124,7 +124,7 @@ class TelemetryEncoder:
     """Items of the hub to records of the telemetry series; devices: by name."""
 
     def __init__(self, devices: Mapping[str, RecordedDevice]) -> None:
-        self._forms = {name: batch_form(name, device) for name, device in devices.items()}
+        self._forms = {name: make_batch_schema(name, device) for name, device in devices.items()}
         self._stages = stages_of(devices)
         self._table: dict[str, float] = {}  # unit -> last position of the stage in that unit
 
@@ -140,7 +140,7 @@ class TelemetryEncoder:
                 form = self._forms[item.device]
                 yield MessageRecord(form.topic, item.time_ns, form.encode(item))
                 if item.device in self._stages:
-                    yield from self._pose(item)
+                    yield from self._encode_pose(item)
             case Frame():
                 pass
             case Original():
@@ -151,7 +151,7 @@ class TelemetryEncoder:
                 yield MessageRecord(messages.EVENT, item.time_ns, messages.encode_event(item))
                 yield MessageRecord(messages.LOG, item.time_ns, messages.encode_log(item))
 
-    def _pose(self, batch: Batch) -> Iterator[MessageRecord]:
+    def _encode_pose(self, batch: Batch) -> Iterator[MessageRecord]:
         """The table's pose for viewers, once both stages have reported their positions; none while one has none."""
         for reading in batch.readings:
             if reading.channel == self._stages[batch.device]:

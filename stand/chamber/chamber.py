@@ -11,12 +11,12 @@ from pathlib import Path
 from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamber
 from thermostand.drivers.devices.protocols import Controller, Switches
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
-from thermostand.foundation.clock import Clock, boot_of, seconds_ns
+from thermostand.foundation.clock import Clock, get_boot, to_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Occupied
 from thermostand.foundation.events import NO_DEAD_MAN, REGULATOR_OCCUPIED
 from thermostand.foundation.hub import Hub
-from thermostand.stand.chamber.compressor import CompressorFile, restored
-from thermostand.stand.chamber.keeper import Keeper
+from thermostand.stand.chamber.compressor import CompressorFile, load_state
+from thermostand.stand.chamber.permit_renewer import PermitRenewer
 from thermostand.stand.chamber.permits import PermitLimits, Permits
 from thermostand.stand.interlock import Interlock
 
@@ -37,7 +37,7 @@ class ChamberLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Ordered:
+class ChamberOrder:
     """What the chamber was told, whether the regulator answers now or not: the set-point, and since when heat and cold
     are permitted (ns)."""
 
@@ -66,30 +66,30 @@ class Chamber:
         self._interlock = interlock
         self._hub = hub
         self._clock = clock
-        self._asked = object()  # the last order; one that is under way ends with the next
-        self._ordered: Ordered | None = None
+        self._latest_order = object()  # the last order; one that is under way ends with the next
+        self._order: ChamberOrder | None = None
         self.compressor_file = CompressorFile(limits.compressor_file, hub, clock)
-        compressor = restored(limits.compressor_file, clock.now_ns(), boot_of(clock))
+        compressor = load_state(limits.compressor_file, clock.now_ns(), get_boot(clock))
         self.permits = Permits(relays, limits.permits, compressor, self.compressor_file.note, hub, clock)
-        self.keeper = Keeper(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
+        self.permit_renewer = PermitRenewer(self.permits, regulator, hub, clock, limits.renew_s, coils_read)
 
     @property
-    def ordered(self) -> Ordered | None:
+    def ordered(self) -> ChamberOrder | None:
         """None while nothing is permitted: the set-point that the regulator remembers is then nobody's wish."""
-        return self._ordered if self.permits.granted else None
+        return self._order if self.permits.is_granted else None
 
     async def start(self, setpoint_degC: float) -> None:
         """Permit heating and cooling, set the set-point, run the regulator; done when the set-point is there. A
         regulator that does not run leaves no permission."""
-        way_degC = await self._way_to(setpoint_degC)
-        asked = self._asked = object()
+        way_degC = await self._plan_set_points(setpoint_degC)
+        asked = self._latest_order = object()
         await self._send(way_degC[0])
         self._interlock.check()  # after every wait: a fault may have closed it meanwhile
         since_ns = self._clock.now_ns() if self.ordered is None else self.ordered.since_ns
-        self._ordered = Ordered(setpoint_degC, since_ns)
+        self._order = ChamberOrder(setpoint_degC, since_ns)
         self.permits.grant()
         try:
-            await self.keeper.beat()
+            await self.permit_renewer.renew_once()
             self._interlock.check()
             await self._regulator.run()
         except DeviceError:
@@ -99,19 +99,19 @@ class Chamber:
         except BaseException:
             self.permits.revoke()
             raise
-        await self._walk(way_degC[1:], asked)
+        await self._ramp(way_degC[1:], asked)
 
     async def set_temperature(self, setpoint_degC: float) -> None:
         """A new set-point, done when it is there; ConfigError outside the limits. While an operator has the regulator
         autotune this waits until that ends or the guard holds the stand; event `regulator_occupied`."""
-        way_degC = await self._way_to(setpoint_degC)
-        asked = self._asked = object()
+        way_degC = await self._plan_set_points(setpoint_degC)
+        asked = self._latest_order = object()
         await self._send(way_degC[0])
-        if self._ordered is not None:
-            self._ordered = replace(self._ordered, setpoint_degC=setpoint_degC)
-        await self._walk(way_degC[1:], asked)
+        if self._order is not None:
+            self._order = replace(self._order, setpoint_degC=setpoint_degC)
+        await self._ramp(way_degC[1:], asked)
 
-    async def _way_to(self, setpoint_degC: float) -> list[float]:
+    async def _plan_set_points(self, setpoint_degC: float) -> list[float]:
         """The set-points from where the air is to this one, no two further apart than _STEP_K where there is a limit to
         their rate."""
         low, high = self._limits.setpoint_degC
@@ -129,12 +129,12 @@ class Chamber:
         way_degC = (begin_degC + (setpoint_degC - begin_degC) * step / steps for step in range(1, steps))
         return [*(min(max(each, low), high) for each in way_degC), setpoint_degC]
 
-    async def _walk(self, way_degC: list[float], asked: object) -> None:
+    async def _ramp(self, way_degC: list[float], asked: object) -> None:
         """One after another at the rate allowed; another order takes over from it."""
         for setpoint_degC in way_degC:
-            step_ns = seconds_ns(60.0 * _STEP_K / self._limits.K_per_min)
+            step_ns = to_ns(60.0 * _STEP_K / self._limits.K_per_min)
             await self._clock.sleep_until(self._clock.now_ns() + step_ns)
-            if asked is not self._asked:
+            if asked is not self._latest_order:
                 return
             await self._send(setpoint_degC)
 
@@ -148,11 +148,11 @@ class Chamber:
                 if not is_waiting:
                     self._hub.publish(REGULATOR_OCCUPIED.at(self._clock.now_ns(), str(error)))
                 is_waiting = True
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_OCCUPIED_AGAIN_S))
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(_OCCUPIED_AGAIN_S))
 
     async def stop(self) -> None:
         """Stop the regulator; heating and cooling lose their permission at once, also when it does not stop."""
-        self._asked = object()
+        self._latest_order = object()
         self.permits.revoke()
         try:
             await self._regulator.stop()
@@ -164,7 +164,7 @@ class Chamber:
         module that heats; DeviceFault when the regulator gives heat all the same, or one of them cannot be relied upon.
         is_timed: as of Permits. Event `no_dead_man` without a board."""
         if not self._relays.has_timer:
-            return self._tell_dead_man()
+            return self._report_missing_dead_man()
         output = {reading.channel: reading.value for reading in await self._regulator.read()}
         name = self._regulator.name
         if not output.get(f"{name}.mv_heat", 0.0) <= 0:
@@ -173,7 +173,7 @@ class Chamber:
         if isinstance(self._regulator, SoftwareRegulator):
             await self._regulator.test_dead_man()
 
-    def _tell_dead_man(self) -> None:
+    def _report_missing_dead_man(self) -> None:
         """No board drops the heat when this daemon dies: what ends it then is recorded with the session."""
         what = self._regulator.dead_man if isinstance(self._regulator, ClimateChamber) else "nothing"
         self._hub.publish(NO_DEAD_MAN.at(self._clock.now_ns(), device=self._regulator.name, ends_it=what))

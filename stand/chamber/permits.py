@@ -16,7 +16,7 @@ from enum import StrEnum
 from thermostand.drivers.devices.protocols import Switches
 from thermostand.drivers.devices.relays import COMPRESSOR, WATCHED
 from thermostand.drivers.devices.relays import HEATER_ENABLE as HEATER
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault
 from thermostand.foundation.events import (
     COMPRESSOR_DROPPED,
@@ -79,7 +79,7 @@ class Permits:
         self.name = relays.name
         self.permission = Permission.REVOKED
         self.intrusions = 0  # how often heat or cold were switched on by others since the permission was withdrawn
-        self.allowed: Callable[[], bool] = lambda: True
+        self.is_allowed: Callable[[], bool] = lambda: True
         self._relays = relays
         self._limits = limits
         self._compressor = compressor
@@ -91,14 +91,14 @@ class Permits:
         self._comparing = asyncio.Lock()  # what is compared must not be switched meanwhile, but for making safe
 
     @property
-    def granted(self) -> bool:
+    def is_granted(self) -> bool:
         """Whether heat and cold are permitted."""
         return self.permission is Permission.GRANTED
 
     @property
-    def gives(self) -> bool:
+    def may_heat(self) -> bool:
         """Whether heat may be given now: permitted, and the guard finds all well."""
-        return self.granted and self.allowed()
+        return self.is_granted and self.is_allowed()
 
     @property
     def timer_s(self) -> float | None:
@@ -110,7 +110,7 @@ class Permits:
         """When the board's own timer ended heat that is permitted, because it was not renewed; None while it lasts."""
         until_ns = self._until_ns.get(HEATER)
         is_over = until_ns is not None and until_ns <= self._clock.now_ns()
-        return until_ns if is_over and self.granted and self._relays.has_timer else None
+        return until_ns if is_over and self.is_granted and self._relays.has_timer else None
 
     def grant(self) -> None:
         """Permit heat and cold; `arm` switches."""
@@ -120,7 +120,7 @@ class Permits:
         """Nothing is armed from now on."""
         self.permission = Permission.REVOKED
 
-    def forgive(self) -> None:
+    def clear_intrusions(self) -> None:
         """An operator has found out what switched heat or cold on."""
         self.intrusions = 0
 
@@ -128,31 +128,31 @@ class Permits:
         """Both off, confirmed; DeviceError."""
         self.revoke()
         await self._relays.make_safe()
-        self._are_off()
+        self._note_off()
 
-    async def withdraw_left_on(self) -> None:
+    async def switch_off_left_on(self) -> None:
         """Before anything else: what another daemon or a hand left on is switched off, event `left_on`. A
         compressor that ran until now begins its rest now."""
-        left_on = {name for name, on in (await self._coils()).items() if on} & set(WATCHED)
+        left_on = {name for name, on in (await self._read_coils()).items() if on} & set(WATCHED)
         await self._relays.make_safe()
         for channel in sorted(left_on):
-            self._say_of(LEFT_ON, channel)
+            self._publish_event(LEFT_ON, channel)
         if COMPRESSOR in left_on:
-            self._set(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
-        self._are_off()
+            self._set_compressor(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
+        self._note_off()
 
     async def arm(self, mv_heat: float, mv_cool: float) -> dict[str, bool]:
         """Compare and, while permitted and allowed, arm the relays again; the regulator's outputs in %. Returns what
         the coils read before that. Both drop by themselves `hold_s` later."""
         async with self._comparing:
-            coils = await self._coils()
-            if self.granted:
+            coils = await self._read_coils()
+            if self.is_granted:
                 self._compare(coils)
-            if self.granted and coils.get(COMPRESSOR) and not self._compressor.running:
-                await self._intruded(COMPRESSOR)
-            if self.gives:
+            if self.is_granted and coils.get(COMPRESSOR) and not self._compressor.running:
+                await self._undo_intrusion(COMPRESSOR)
+            if self.may_heat:
                 await self._hold_on(HEATER)
-            if self.gives and COMPRESSOR in coils:  # still, after the wait
+            if self.may_heat and COMPRESSOR in coils:  # still, after the wait
                 await self._arm_compressor(mv_heat, mv_cool)
             return coils
 
@@ -161,10 +161,10 @@ class Permits:
         the coils read before that."""
         async with self._comparing:
             was_withdrawn = self.permission is Permission.WITHDRAWN
-            coils = await self._coils()
+            coils = await self._read_coils()
             for channel in WATCHED:
                 if coils.get(channel) and was_withdrawn and self.permission is Permission.WITHDRAWN:
-                    await self._intruded(channel)
+                    await self._undo_intrusion(channel)
             return coils
 
     async def test_dead_man(self, *, is_timed: bool) -> None:
@@ -175,7 +175,7 @@ class Permits:
         board is looked at all the time, and `held_s` is how long after the second arming its relay was seen to drop.
         """
         for test in range(_TEST_TRIES):
-            if (found := await self._timer_found(is_timed)) is not None:
+            if (found := await self._measure_timer(is_timed)) is not None:
                 break
             self._hub.publish(DEAD_MAN_LATE.at(self._clock.now_ns(), device=self.name, test=test + 1))
         else:
@@ -195,7 +195,7 @@ class Permits:
         self._hub.publish(DEAD_MAN_TESTED.at(self._clock.now_ns(), text, **data))
         raise DeviceFault(self.name, text)
 
-    async def _timer_found(self, is_timed: bool) -> tuple[bool, bool, float | None] | None:
+    async def _measure_timer(self, is_timed: bool) -> tuple[bool, bool, float | None] | None:
         """Whether the relay was held by the second arming, whether it then dropped, and after how many s; None when
         the commands came so late that this says nothing: a second arming after the first one's time arms any board."""
         pulse_s, sent_ns = self._limits.self_test_s, self._clock.now_ns()
@@ -205,15 +205,15 @@ class Permits:
             begin_ns = self._clock.now_ns()  # it may count from here
 
             async def at(units: float) -> bool:
-                await self._clock.sleep_until(begin_ns + seconds_ns(units * unit_s))
-                return (await self._coils())[HEATER]
+                await self._clock.sleep_until(begin_ns + to_ns(units * unit_s))
+                return (await self._read_coils())[HEATER]
 
             await at(_AGAIN)
             again_ns = self._clock.now_ns()
             await self._relays.hold_on(HEATER, pulse_s)
-            is_late = self._clock.now_ns() >= sent_ns + seconds_ns(pulse_s)
+            is_late = self._clock.now_ns() >= sent_ns + to_ns(pulse_s)
             on = await at(_STILL_ON)
-            is_late = is_late or (not on and self._clock.now_ns() >= again_ns + seconds_ns(pulse_s))
+            is_late = is_late or (not on and self._clock.now_ns() >= again_ns + to_ns(pulse_s))
             units = _STILL_ON
             while is_timed and held_s is None and (units := units + _LOOK) < _OFF:
                 if not await at(units):
@@ -233,47 +233,47 @@ class Permits:
             if coils.get(channel) or not until_ns:
                 continue
             del self._until_ns[channel]
-            early = until_ns - now_ns > seconds_ns(_EARLY_S)
+            early = until_ns - now_ns > to_ns(_EARLY_S)
             came_on = channel in self._came_on
             self._came_on.discard(channel)
             if channel == COMPRESSOR and self._compressor.running:
                 # One that was not renewed in time has dropped by itself: its rest began there.
-                self._set(
+                self._set_compressor(
                     CompressorState(False, now_ns if early else min(now_ns, until_ns), self._compressor.starts_ns)
                 )
             if early and not came_on:
-                self._say_of(HEATER_NOT_ON if channel == HEATER else COMPRESSOR_NOT_ON, channel)
+                self._publish_event(HEATER_NOT_ON if channel == HEATER else COMPRESSOR_NOT_ON, channel)
             elif early:
                 left_s = (until_ns - now_ns) / NS_PER_S
-                self._say_of(HEATER_DROPPED if channel == HEATER else COMPRESSOR_DROPPED, channel, left_s=left_s)
+                self._publish_event(HEATER_DROPPED if channel == HEATER else COMPRESSOR_DROPPED, channel, left_s=left_s)
 
     async def _arm_compressor(self, mv_heat: float, mv_cool: float) -> None:
         wanted = decide(self._compressor, self._limits.compressor, mv_heat, mv_cool, self._clock.now_ns())
         switched = wanted.running != self._compressor.running
         if wanted.running:
             if switched:
-                self._set(wanted)  # before it runs: a start that is not confirmed counts, too
+                self._set_compressor(wanted)  # before it runs: a start that is not confirmed counts, too
             await self._hold_on(COMPRESSOR)
         elif switched:
             await self._relays.switch(COMPRESSOR, on=False)
             self._until_ns.pop(COMPRESSOR, None)
-        self._set(wanted)
+        self._set_compressor(wanted)
         if switched:
-            said = "started" if wanted.running else "stopped"
-            self._hub.publish(COMPRESSOR_SWITCHED.at(self._clock.now_ns(), said, running=wanted.running))
+            text = "started" if wanted.running else "stopped"
+            self._hub.publish(COMPRESSOR_SWITCHED.at(self._clock.now_ns(), text, running=wanted.running))
 
-    async def _intruded(self, channel: str) -> None:
+    async def _undo_intrusion(self, channel: str) -> None:
         """It was switched on, and not by this daemon."""
         self.intrusions += 1
         now_ns = self._clock.now_ns()
         await self._relays.switch(channel, on=False)
         if channel == COMPRESSOR:
-            self._set(CompressorState(False, self._clock.now_ns(), (*self._compressor.starts_ns, now_ns)))
-        self._say_of(SWITCHED_OFF, channel)
+            self._set_compressor(CompressorState(False, self._clock.now_ns(), (*self._compressor.starts_ns, now_ns)))
+        self._publish_event(SWITCHED_OFF, channel)
 
     async def _hold_on(self, channel: str) -> None:
         """Armed from the instant of the call at the earliest."""
-        until_ns = self._clock.now_ns() + seconds_ns(self._limits.hold_s)
+        until_ns = self._clock.now_ns() + to_ns(self._limits.hold_s)
         try:
             await self._relays.hold_on(channel, self._limits.hold_s)
         except DeviceError:  # it may be on all the same: a compressor that then drops has run, and has to rest
@@ -281,23 +281,23 @@ class Permits:
             raise
         self._until_ns[channel] = until_ns
 
-    def _are_off(self) -> None:
+    def _note_off(self) -> None:
         """Both have been confirmed off."""
         self._until_ns.clear()
-        if not self.granted:
+        if not self.is_granted:
             self.permission = Permission.WITHDRAWN
         if self._compressor.running:
-            self._set(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
+            self._set_compressor(CompressorState(False, self._clock.now_ns(), self._compressor.starts_ns))
 
-    def _set(self, compressor: CompressorState) -> None:
+    def _set_compressor(self, compressor: CompressorState) -> None:
         was, self._compressor = self._compressor, compressor
         if (compressor.running, compressor.since_ns) != (was.running, was.since_ns):
             self._keep(compressor)
 
-    async def _coils(self) -> dict[str, bool]:
+    async def _read_coils(self) -> dict[str, bool]:
         readings = await self._relays.read()
         return {reading.channel.partition(".")[2]: reading.value == 1 for reading in readings}
 
-    def _say_of(self, kind: EventKind, channel: str, **data: object) -> None:
+    def _publish_event(self, kind: EventKind, channel: str, **data: object) -> None:
         now_ns = self._clock.now_ns()
         self._hub.publish(kind.at(now_ns, device=self.name, relay=channel, times=self.intrusions, **data))

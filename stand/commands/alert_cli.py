@@ -7,8 +7,8 @@ import typer
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, StandError
 from thermostand.foundation.output import show
-from thermostand.foundation.usage import one_line
-from thermostand.stand.commands.reached import ConfigOption
+from thermostand.foundation.usage import escape_line
+from thermostand.stand.commands.endpoint import ConfigOption
 
 app = App(no_args_is_help=True)
 _LIMIT_S = 20.0
@@ -29,11 +29,11 @@ def try_them(config: ConfigOption = "simulated") -> None:
     Example: stand alert test --config my-stand.yaml
     """
     from thermostand.stand.config.alerts_section import AlertSecrets, load_secrets
-    from thermostand.stand.config.stand_config import load_config, packaged
+    from thermostand.stand.config.stand_config import find_packaged, load_config
     from thermostand.stand.serving.alerts import check_alerts
     from thermostand.stand.serving.alerts_process import deliver, ping, run_command
 
-    stand = load_config(packaged("", config))
+    stand = load_config(find_packaged("", config))
     alerts = stand.alerts
     if alerts.secrets is None and not alerts.command:
         raise ConfigError(
@@ -49,7 +49,7 @@ def try_them(config: ConfigOption = "simulated") -> None:
     if alerts.command:
         failures += run_command(alerts.command, alerts.command_limit_s, title, text)
     for _, failure in failures:
-        typer.echo(one_line(failure), err=True)
+        typer.echo(escape_line(failure), err=True)
     receivers = len(found.urls) + bool(alerts.command)
     if failures:
         raise StandError(f"{len(failures)} of {receivers + bool(found.alive_url)} were not reached")

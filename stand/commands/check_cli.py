@@ -10,20 +10,20 @@ from typing import Annotated
 
 import typer
 
-from thermostand.drivers.devices.checking import Finding, worst
+from thermostand.drivers.devices.device_check import Finding, find_worst
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.command_app import App
 from thermostand.foundation.documents import read_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.exit_codes import FAILED
-from thermostand.foundation.output import output, show
-from thermostand.foundation.usage import one_line
-from thermostand.stand.commands.reached import ConfigOption
+from thermostand.foundation.output import get_output, show
+from thermostand.foundation.usage import escape_line
+from thermostand.stand.commands.endpoint import ConfigOption
 from thermostand.stand.commissioning.commissioning import commission
 from thermostand.stand.commissioning.genicam_rehearsal import rehearse
 from thermostand.stand.commissioning.record import CommissioningRecord
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.running.order import register_texts
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.running.order import read_register_texts
 
 app = App()
 
@@ -50,22 +50,24 @@ def check(
 
     Example: stand check --config my-stand.yaml --moves
     """
-    path = packaged("", config)
+    path = find_packaged("", config)
     stand = load_config(path)
     if genicam is not None:
         _rehearse(genicam, None if _is_installed(path) else stand)
         return
-    texts = {"config.yaml": read_document(path), **register_texts(stand)}
+    texts = {"config.yaml": read_document(path), **read_register_texts(stand)}
     clock = WallClock()
     began_ns = clock.now_ns()
-    found, identities = asyncio.run(commission(stand, _nothing if output().as_json else _tell, has_moves=moves))
+    found, identities = asyncio.run(
+        commission(stand, _ignore_findings if get_output().as_json else _print_findings, has_moves=moves)
+    )
     record = CommissioningRecord(stand, str(path), texts, began_ns, clock.now_ns(), moves, found, identities)
     kept = "not kept, since this is an installed file; copy it to have a stand of your own"
     if not _is_installed(path):
         _, page = record.write(path)
         kept = f"kept as {page}"
-    show(record.data(), [one_line(_summary(found, kept, moves=moves))])
-    if worst(found) == "failed":
+    show(record.data(), [escape_line(_format_summary(found, kept, moves=moves))])
+    if find_worst(found) == "failed":
         raise typer.Exit(FAILED)
 
 
@@ -75,16 +77,16 @@ def _rehearse(file: Path, stand: StandConfig | None) -> None:
     lines = [found.camera or str(file), *(f"  {purpose:<14}{name or '-'}" for purpose, name in found.features.items())]
     if found.refusal:
         lines.append(f"refused: {found.refusal}" if found.is_played else found.refusal)
-    show(found, map(one_line, lines))
+    show(found, map(escape_line, lines))
     if found.refusal:
         raise typer.Exit(FAILED)
 
 
-def _nothing(_: tuple[Finding, ...]) -> None:
+def _ignore_findings(_: tuple[Finding, ...]) -> None:
     """The summary at the end."""
 
 
-def _tell(findings: tuple[Finding, ...]) -> None:
+def _print_findings(findings: tuple[Finding, ...]) -> None:
     """A line for each device with what is well, and two for each thing that is not."""
     for name, group in groupby(findings, lambda finding: finding.device):
         found = tuple(group)
@@ -94,10 +96,10 @@ def _tell(findings: tuple[Finding, ...]) -> None:
                 lines.append((each.verdict, f"{each.what}: {each.text}"))
                 lines += [("", f"-> {each.advice}")] if each.advice else []
         for number, (verdict, text) in enumerate(lines):
-            typer.echo(one_line(f"{name if number == 0 else '':<{_NAME}}{verdict:<{_VERDICT}}{text}"))
+            typer.echo(escape_line(f"{name if number == 0 else '':<{_NAME}}{verdict:<{_VERDICT}}{text}"))
 
 
-def _summary(findings: tuple[Finding, ...], kept: str, *, moves: bool) -> str:
+def _format_summary(findings: tuple[Finding, ...], kept: str, *, moves: bool) -> str:
     words = {"failed": "failed", "warning": "to be looked at", "unverified": "to be verified by hand"}
     counts = [(sum(each.verdict == verdict for each in findings), word) for verdict, word in words.items()]
     text = ", ".join(f"{count} {word}" for count, word in counts if count) or "all well"

@@ -16,7 +16,7 @@ from thermostand.foundation.documents import write_schemas
 from thermostand.foundation.output import show
 from thermostand.markers.target import Target
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 app = App(
     no_args_is_help=True,
@@ -43,5 +43,5 @@ def schema(
 
     Example: stand config schema --out schema
     """
-    written = list(write_schemas(out or packaged("", "simulated").parent / "schema", DOCUMENTS))
+    written = list(write_schemas(out or find_packaged("", "simulated").parent / "schema", DOCUMENTS))
     show(written, written)

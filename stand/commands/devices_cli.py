@@ -13,15 +13,15 @@ from thermostand.drivers.wires.discovery import (
     FoundCamera,
     SerialPort,
     UsbDevice,
-    cameras_at,
-    serial_ports,
-    usb_devices,
+    find_cameras,
+    list_serial_ports,
+    list_usb_devices,
 )
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.output import show
-from thermostand.foundation.usage import one_line
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.foundation.usage import escape_line
+from thermostand.stand.config.stand_config import find_packaged, load_config
 
 app = App()
 
@@ -46,33 +46,33 @@ def devices(
     """
     addresses = list(ask or ())
     if config is not None:
-        stand = load_config(packaged("", config))
+        stand = load_config(find_packaged("", config))
         gige = (camera for camera in stand.cameras.values() if isinstance(camera, GigeCameraSettings))
         addresses += [camera.address for camera in gige]
     try:
-        cameras = asyncio.run(cameras_at(addresses, wait_s)) if addresses else ()
+        cameras = asyncio.run(find_cameras(addresses, wait_s)) if addresses else ()
     except (OSError, ValueError) as error:
         raise ConfigError(f"cameras cannot be asked at {', '.join(addresses)}: {error}") from error
-    ports, usb = serial_ports(), usb_devices()
+    ports, usb = list_serial_ports(), list_usb_devices()
     found = {"serial": ports, "usb": usb, "cameras": cameras}
     data = {kind: [asdict(each) for each in some] for kind, some in found.items()}
-    show(data, map(one_line, _lines(ports, usb, cameras, addresses)))
+    show(data, map(escape_line, _format_lines(ports, usb, cameras, addresses)))
 
 
-def _lines(
+def _format_lines(
     ports: tuple[SerialPort, ...], usb: tuple[UsbDevice, ...], cameras: tuple[FoundCamera, ...], asked: list[str]
 ) -> list[str]:
     lines = ["serial ports" + ("" if ports else ": none")]
-    lines += [f"  serial:{each.address}  {each.what}{_numbered(each.serial)}" for each in ports]
+    lines += [f"  serial:{each.address}  {each.what}{_format_serial(each.serial)}" for each in ports]
     lines.append("USB devices" + ("" if usb else ": none"))
-    lines += [f"  {each.vendor:04x}:{each.product:04x}  {each.what}{_numbered(each.serial)}" for each in usb]
+    lines += [f"  {each.vendor:04x}:{each.product:04x}  {each.what}{_format_serial(each.serial)}" for each in usb]
     if not asked:
         return [*lines, "cameras: not asked for; `--ask ADDRESS` asks one, or a whole network at its broadcast address"]
     lines.append(
         "cameras" + ("" if cameras else f": none has answered at {', '.join(asked)} (without supply none does)")
     )
     lines += [
-        f"  {each.address}  {each.make} {each.model}, firmware {each.firmware}{_numbered(each.serial)}"
+        f"  {each.address}  {each.make} {each.model}, firmware {each.firmware}{_format_serial(each.serial)}"
         for each in cameras
     ]
     silent = [address for address in asked if address not in {each.address for each in cameras}]
@@ -81,5 +81,5 @@ def _lines(
     return lines
 
 
-def _numbered(serial: str) -> str:
+def _format_serial(serial: str) -> str:
     return f', serial number "{serial}"' if serial else ""

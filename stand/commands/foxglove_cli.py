@@ -10,7 +10,7 @@ import typer
 
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.commands.reached import on_stand
+from thermostand.stand.commands.endpoint import on_stand
 from thermostand.stand.serving.client import Server
 
 app = App()
@@ -32,9 +32,9 @@ def foxglove(
         from thermostand.stand.commands.foxglove_live import HOST, FoxgloveServer
     except ModuleNotFoundError as error:
         raise ConfigError("it needs foxglove-sdk: pip install 'thermostand[foxglove]'") from error
-    from thermostand.stand.commands.moment import There
+    from thermostand.stand.commands.status_snapshot import RemoteStand
 
-    there = There(server)
+    remote = RemoteStand(server)
     try:
         published = FoxgloveServer(server.state().stand, port)
     except (OSError, RuntimeError) as error:
@@ -43,10 +43,10 @@ def foxglove(
     try:
         with suppress(KeyboardInterrupt):
             while True:
-                for event in there.events():
+                for event in remote.events():
                     published.event(event)
                 published.state(server.state())
-                published.picture(server.picture)
+                published.publish_picture(server.fetch_picture)
                 threading.Event().wait(_LOOK_S)
     finally:
         published.close()

@@ -18,7 +18,7 @@ from foxglove.channels import CompressedImageChannel, LogChannel
 from foxglove.messages import CompressedImage, Log, LogLevel, Timestamp
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.stand.serving.desk import StandState
+from thermostand.stand.serving.api_models import StandState
 
 HOST = "127.0.0.1"
 _BACKLOG = 8  # messages that wait for a slow viewer; the oldest is dropped
@@ -59,7 +59,7 @@ class FoxgloveServer:
             time_ns = max(r.time_ns for channel, r in state.readings.items() if channel.startswith(f"{device}."))
             if time_ns > self._read_ns.get(device, 0):
                 self._read_ns[device] = time_ns
-                self._channel(device, values).log(values, log_time=time_ns + state.utc_offset_ns)
+                self._get_channel(device, values).log(values, log_time=time_ns + state.utc_offset_ns)
         words = {name: getattr(state, name) for name in _STATE}
         words |= {"held_by": ", ".join(state.reasons), "fault": "" if state.fault is None else state.fault.text}
         words["by_hand_setpoint_degC"] = None if state.by_hand is None else state.by_hand.setpoint_degC
@@ -70,19 +70,19 @@ class FoxgloveServer:
         """An event as the interface gives it."""
         time_ns = cast("int", event["time_ns"]) + cast("int", event["utc_offset_ns"])
         level, kind = _LEVELS.get(str(event["level"]), LogLevel.Info), str(event["kind"])
-        self._events.log(Log(timestamp=_stamp(time_ns), level=level, message=str(event["text"]), name=kind))
+        self._events.log(Log(timestamp=_make_timestamp(time_ns), level=level, message=str(event["text"]), name=kind))
 
-    def picture(self, picture: Picture) -> None:
+    def publish_picture(self, picture: Picture) -> None:
         """The last frame, when somebody looks at frames; it is asked for then only."""
         found = picture() if self._camera.has_sinks() else None
         if found is None or found[0] == self._picture_ns:
             return
         self._picture_ns, jpeg = found
         time_ns = self._picture_ns + self._utc_offset_ns
-        image = CompressedImage(timestamp=_stamp(time_ns), frame_id="camera", data=jpeg, format="jpeg")
+        image = CompressedImage(timestamp=_make_timestamp(time_ns), frame_id="camera", data=jpeg, format="jpeg")
         self._camera.log(image, log_time=time_ns)
 
-    def _channel(self, device: str, values: Mapping[str, object]) -> foxglove.Channel:
+    def _get_channel(self, device: str, values: Mapping[str, object]) -> foxglove.Channel:
         if device not in self._readings:
             properties: dict[str, Any] = {name: {"type": ["number", "null"]} for name in values}
             schema = {"type": "object", "title": device, "properties": properties}
@@ -90,5 +90,5 @@ class FoxgloveServer:
         return self._readings[device]
 
 
-def _stamp(time_ns: int) -> Timestamp:
+def _make_timestamp(time_ns: int) -> Timestamp:
     return Timestamp(sec=time_ns // NS_PER_S, nsec=time_ns % NS_PER_S)

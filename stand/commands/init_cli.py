@@ -12,13 +12,13 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from thermostand.drivers.wires.discovery import SerialPort, UsbDevice, cameras_at, serial_ports, usb_devices
+from thermostand.drivers.wires.discovery import SerialPort, UsbDevice, find_cameras, list_serial_ports, list_usb_devices
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.output import say, show
-from thermostand.foundation.usage import one_line
-from thermostand.stand.config.new_stand import Connected, ConnectedAxis, new_stand
-from thermostand.stand.estimating.run_estimate import price_night
+from thermostand.foundation.usage import escape_line
+from thermostand.stand.config.new_stand import Connected, ConnectedAxis, make_stand_files
+from thermostand.stand.estimating.run_estimate import estimate_plan
 from thermostand.stand.running.order import load_order
 
 app = App()
@@ -54,16 +54,16 @@ def init(
 
     Example: stand init my-stand --bus /dev/serial/by-id/usb-FTDI-port0 --camera 192.168.10.2
     """
-    given = Connected(_bus(bus), flap, camera, "", tuple(map(_axis, axis or ())))
+    given = Connected(_parse_bus(bus), flap, camera, "", tuple(map(_parse_axis, axis or ())))
     if simulated and given != Connected():
         raise ConfigError("--simulated has devices of its own; leave --bus, --flap, --camera and --axis out")
     is_asked = ask and not simulated and _is_terminal()
-    connected = None if simulated else _identified(_asked(given) if is_asked else given)
-    texts = new_stand(name or directory.absolute().name, connected)
+    connected = None if simulated else _identify_camera(_ask_missing(given) if is_asked else given)
+    texts = make_stand_files(name or directory.absolute().name, connected)
     _check(texts)
     written = _write(directory, texts)
     show({"written": written}, written)
-    for what in _missing(connected):
+    for what in _list_missing(connected):
         say(f"{directory / 'stand.yaml'}: {what} is still to be written; `stand devices` shows what there is")
     say(f"now: stand plan {directory / 'recipe.yaml'} --config {directory / 'stand.yaml'}")
 
@@ -72,20 +72,24 @@ def _is_terminal() -> bool:
     return sys.stdin.isatty()
 
 
-def _asked(given: Connected) -> Connected:
+def _ask_missing(given: Connected) -> Connected:
     """What is not given is chosen among what is connected; an empty answer leaves it out."""
-    ports, usb = serial_ports(), usb_devices()
+    ports, usb = list_serial_ports(), list_usb_devices()
     controllers = [port for port in ports if _CONTROLLER.fullmatch(port.address)]
     others = [port for port in ports if port not in controllers]
     axes = list(given.axes)
     for name in _AXES:
         if all(one.name != name for one in axes) and controllers:
-            port = _choose(f"controller of the {name} stage", controllers, _port_text)
-            axes += [_axis(f"{name}={port.address}:{_number(port)}")] if port is not None else []
-    bus = given.bus or _address(_choose("RS-485 adapter of regulator, relays and thermometers", others, _port_text))
-    bus = bus or _bus(str(typer.prompt("address of their Modbus TCP gateway (empty: none)", default="", err=True)))
+            port = _choose(f"controller of the {name} stage", controllers, _format_port)
+            axes += [_parse_axis(f"{name}={port.address}:{_parse_serial_number(port)}")] if port is not None else []
+    bus = given.bus or _get_address(
+        _choose("RS-485 adapter of regulator, relays and thermometers", others, _format_port)
+    )
+    bus = bus or _parse_bus(
+        str(typer.prompt("address of their Modbus TCP gateway (empty: none)", default="", err=True))
+    )
     flaps = [device for device in usb if device.vendor == _POLOLU]
-    chosen = None if given.flap else _choose("controller of the flap", flaps, _usb_text)
+    chosen = None if given.flap else _choose("controller of the flap", flaps, _format_usb)
     flap = given.flap or ("" if chosen is None else chosen.serial)
     camera = given.camera or str(typer.prompt("address of the GigE camera (empty: none)", default="", err=True))
     return Connected(bus, flap, camera, "", tuple(axes))
@@ -96,24 +100,24 @@ def _choose(what: str, found: Sequence[Found], text: Callable[[Found], str]) -> 
     if not found:
         return None
     for number, each in enumerate(found, 1):
-        typer.echo(one_line(f"  {number}  {text(each)}"), err=True)
+        typer.echo(escape_line(f"  {number}  {text(each)}"), err=True)
     answer = int(typer.prompt(f"{what} (0: none of these)", type=int, default=1 if len(found) == 1 else 0, err=True))
     return found[answer - 1] if 1 <= answer <= len(found) else None
 
 
-def _port_text(port: SerialPort) -> str:
+def _format_port(port: SerialPort) -> str:
     return f"{port.address}  {port.what}"
 
 
-def _usb_text(device: UsbDevice) -> str:
+def _format_usb(device: UsbDevice) -> str:
     return f"{device.what}, serial number {device.serial}"
 
 
-def _address(port: SerialPort | None) -> str:
+def _get_address(port: SerialPort | None) -> str:
     return "" if port is None else f"serial:{port.address}"
 
 
-def _bus(text: str) -> str:
+def _parse_bus(text: str) -> str:
     """As the stand's file has it: a device file is a serial port, anything else a gateway, whose usual port is 502."""
     text = text.strip()
     if not text or text.startswith(("serial:", "tcp:")):
@@ -123,13 +127,13 @@ def _bus(text: str) -> str:
     return f"tcp:{text}" if ":" in text else f"tcp:{text}:502"
 
 
-def _number(port: SerialPort) -> int:
+def _parse_serial_number(port: SerialPort) -> int:
     """The controller's serial number is its name in /dev/ximc, in hexadecimal."""
     found = _CONTROLLER.fullmatch(port.address)
     return int(found[1], 16) if found else 0
 
 
-def _axis(text: str) -> ConnectedAxis:
+def _parse_axis(text: str) -> ConnectedAxis:
     name, _, rest = text.partition("=")
     address, _, serial = rest.rpartition(":")
     if name not in _AXES or not address or not serial.isdecimal():
@@ -137,12 +141,12 @@ def _axis(text: str) -> ConnectedAxis:
     return ConnectedAxis(name, address, int(serial))
 
 
-def _identified(connected: Connected) -> Connected:
+def _identify_camera(connected: Connected) -> Connected:
     """With the serial number of the camera that answers; ConfigError when the address cannot be asked."""
     if not connected.camera:
         return connected
     try:
-        found = asyncio.run(cameras_at([connected.camera], _WAIT_S))
+        found = asyncio.run(find_cameras([connected.camera], _WAIT_S))
     except (OSError, ValueError) as error:
         raise ConfigError(f"--camera {connected.camera}: cannot be asked: {error}") from error
     if not found:
@@ -159,14 +163,14 @@ def _check(texts: Mapping[str, str]) -> None:
             order = load_order(str(Path(folder) / "recipe.yaml"), str(Path(folder) / "stand.yaml"))
         except ConfigError as error:  # of a file that nobody will see
             raise ConfigError(f"nothing is written: {str(error).replace(f'{folder}/', '')}") from error
-        price_night(tuple(order.recipe.plan()), order.config, Path(folder))
+        estimate_plan(tuple(order.recipe.plan()), order.config, Path(folder))
 
 
 def _write(directory: Path, texts: Mapping[str, str]) -> list[Path]:
     """All of them; ConfigError, and none written, when one is there already."""
     paths = {directory / name: text for name, text in texts.items()}
-    if there := [path for path in paths if path.exists() or path.is_symlink()]:
-        raise ConfigError(f"{there[0]}: is there already, and stays as it is; choose another folder")
+    if remote := [path for path in paths if path.exists() or path.is_symlink()]:
+        raise ConfigError(f"{remote[0]}: is there already, and stays as it is; choose another folder")
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -177,7 +181,7 @@ def _write(directory: Path, texts: Mapping[str, str]) -> list[Path]:
     return list(paths)
 
 
-def _missing(connected: Connected | None) -> list[str]:
+def _list_missing(connected: Connected | None) -> list[str]:
     if connected is None:
         return []
     stages = {axis.name for axis in connected.axes}

@@ -9,7 +9,7 @@ import yaml
 
 from thermostand.foundation.command_app import App
 from thermostand.foundation.output import show
-from thermostand.foundation.usage import one_line
+from thermostand.foundation.usage import escape_line
 
 app = App(no_args_is_help=True)
 
@@ -39,4 +39,4 @@ def _list(folder: str, described_by: str) -> None:
         text = str(data.get(described_by, "")) if isinstance(data, dict) else ""
         found.append({"name": path.stem, "text": text, "path": str(path)})
     width = max((len(each["name"]) for each in found), default=0)
-    show(found, (one_line(f"{each['name']:<{width}}  {each['text']}") for each in found))
+    show(found, (escape_line(f"{each['name']:<{width}}  {each['text']}") for each in found))

@@ -18,31 +18,31 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from thermostand.foundation.clock import NS_PER_S, Now, WallClock, seconds_ns, utc_offset_ns
+from thermostand.foundation.clock import NS_PER_S, Now, WallClock, to_ns, utc_offset_ns
 from thermostand.foundation.events import RUN_BEGINS
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.instants import format_duration, format_local
 from thermostand.foundation.items import Batch, Event, Item, StepMark
-from thermostand.foundation.output import output
-from thermostand.foundation.usage import one_line
-from thermostand.stand.commands.moment import ShownMoment, event_line, moment_of
-from thermostand.stand.estimating.run_estimate import Night
+from thermostand.foundation.output import get_output
+from thermostand.foundation.usage import escape_line
+from thermostand.stand.commands.status_snapshot import StatusSnapshot, format_event, make_snapshot
+from thermostand.stand.estimating.run_estimate import PlanEstimate
 from thermostand.stand.gate import HELD, RELEASED
-from thermostand.stand.service.run import Front, by_socket
+from thermostand.stand.service.run import Front, serve_by_socket
 from thermostand.stand.service.stand_service import StandService
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.commands import Served
-from thermostand.stand.serving.front import front
+from thermostand.stand.serving.interface import serve_interface
 
 # Output for people, written by a thread of its own: a terminal or a log that blocks delays nothing else.
 
 _MOST_WAITING = 1000  # what comes while so much waits is not shown; it is recorded all the same
 _FAREWELL_S = 2.0  # real seconds for what still waits at the end
 
-Shown = ParamSpec("Shown")
+CallArgs = ParamSpec("CallArgs")
 
 
-class Aside:
+class BackgroundOutput:
     """Makes calls in their order, in a thread that never keeps the process from ending."""
 
     def __init__(self) -> None:
@@ -50,10 +50,10 @@ class Aside:
         self._thread = threading.Thread(target=self._show, name="aside", daemon=True)
         self._thread.start()
 
-    def __call__(self, show: Callable[Shown, object]) -> Callable[Shown, None]:
+    def __call__(self, show: Callable[CallArgs, object]) -> Callable[CallArgs, None]:
         """`show`, made later: its caller never waits."""
 
-        def later(*args: Shown.args, **options: Shown.kwargs) -> None:
+        def later(*args: CallArgs.args, **options: CallArgs.kwargs) -> None:
             with suppress(queue.Full):
                 self._waiting.put_nowait(partial(show, *args, **options))
 
@@ -72,9 +72,9 @@ class Aside:
 
 
 @contextmanager
-def aside() -> Generator[Aside]:
+def open_background_output() -> Generator[BackgroundOutput]:
     """An Aside while inside."""
-    shown = Aside()
+    shown = BackgroundOutput()
     try:
         yield shown
     finally:
@@ -86,30 +86,40 @@ def aside() -> Generator[Aside]:
 _BAR = 24
 
 
-def panel_lines(moment: ShownMoment) -> list[str]:
+def format_panel(moment: StatusSnapshot) -> list[str]:
     """What stands in the panel, a line for each question: what, how warm, what has been seen, how long."""
-    lines = [_step(moment), "   ".join(_temperatures(moment)), "   ".join(_recorded(moment)), _end(moment)]
-    return [one_line(line) for line in lines if line]
+    lines = [
+        _format_step(moment),
+        "   ".join(_format_temperatures(moment)),
+        "   ".join(_format_recorded(moment)),
+        _format_progress(moment),
+    ]
+    return [escape_line(line) for line in lines if line]
 
 
-def plain_line(moment: ShownMoment) -> str:
+def format_line(moment: StatusSnapshot) -> str:
     """The same in one line, for a log."""
-    parts = [_step(moment), ", ".join(_temperatures(moment)), ", ".join(_recorded(moment)), _ends(moment)]
+    parts = [
+        _format_step(moment),
+        ", ".join(_format_temperatures(moment)),
+        ", ".join(_format_recorded(moment)),
+        _format_end_time(moment),
+    ]
     share = "" if moment.share is None else f"{moment.share:4.0%}  "
-    return one_line(f"run: {share}{local_text(moment.now_ns)[:16]}  {'; '.join(part for part in parts if part)}")
+    return escape_line(f"run: {share}{format_local(moment.now_ns)[:16]}  {'; '.join(part for part in parts if part)}")
 
 
-def _step(moment: ShownMoment) -> str:
+def _format_step(moment: StatusSnapshot) -> str:
     number = f"step {moment.step} of {moment.steps}: " if moment.steps else ""
     return f"{number}{moment.doing}" + (f" ({moment.held})" if moment.held else "")
 
 
-def _temperatures(moment: ShownMoment) -> list[str]:
+def _format_temperatures(moment: StatusSnapshot) -> list[str]:
     named = (("set", moment.setpoint_degC), ("air", moment.air_degC), ("camera", moment.camera_degC))
     return [f"{name} {'–' if value is None else f'{value:.2f} °C'}" for name, value in named]
 
 
-def _recorded(moment: ShownMoment) -> list[str]:
+def _format_recorded(moment: StatusSnapshot) -> list[str]:
     planned = moment.frames_planned
     of = f" of {planned}" if planned is not None and planned >= moment.frames else ""
     parts = [f"frames {moment.frames}{of}"] if moment.steps else []
@@ -122,23 +132,23 @@ def _recorded(moment: ShownMoment) -> list[str]:
     return parts
 
 
-def _ends(moment: ShownMoment) -> str:
+def _format_end_time(moment: StatusSnapshot) -> str:
     if moment.end_ns is None:
         return ""
-    within = "" if moment.end_within_s is None else f" ± {_minutes(moment.end_within_s)}"
-    left = duration(max(0, moment.end_ns - moment.now_ns))
-    zone = local_text(moment.end_ns)[19:]
-    return f"ends {local_text(moment.end_ns)[:16]}{zone}{within} (in {left})"
+    within = "" if moment.end_within_s is None else f" ± {_format_minutes(moment.end_within_s)}"
+    left = format_duration(max(0, moment.end_ns - moment.now_ns))
+    zone = format_local(moment.end_ns)[19:]
+    return f"ends {format_local(moment.end_ns)[:16]}{zone}{within} (in {left})"
 
 
-def _end(moment: ShownMoment) -> str:
+def _format_progress(moment: StatusSnapshot) -> str:
     if moment.share is None:
-        return _ends(moment)
+        return _format_end_time(moment)
     done = round(_BAR * moment.share)
-    return f"{'━' * done}{'╌' * (_BAR - done)} {moment.share:.0%}   {_ends(moment)}"
+    return f"{'━' * done}{'╌' * (_BAR - done)} {moment.share:.0%}   {_format_end_time(moment)}"
 
 
-def _minutes(duration_s: float) -> str:
+def _format_minutes(duration_s: float) -> str:
     minutes = round(duration_s / 60.0)
     return f"{minutes} min" if minutes < 120 else f"{minutes / 60.0:.1f} h"
 
@@ -151,14 +161,14 @@ _SHARE = 1e-3
 
 
 @contextmanager
-def view(*, is_virtual: bool = False) -> Generator[View]:
+def open_view(*, is_virtual: bool = False) -> Generator[View]:
     """On standard error, while inside. Of a run in virtual time a line comes at each tenth instead of each minute."""
-    if output().quiet:
+    if get_output().quiet:
         yield Silent()
     elif not sys.stderr.isatty():
         yield PlainLines(WallClock(), is_virtual=is_virtual)
     else:
-        with _foot(WallClock()) as foot:
+        with _open_panel(WallClock()) as foot:
             yield foot
 
 
@@ -168,15 +178,15 @@ class RunFollower:
 
     def __init__(
         self,
-        show: Callable[[ShownMoment], None],
+        show: Callable[[StatusSnapshot], None],
         tell: Callable[[str], None],
         sessions: Path,
-        night_s: float = 0.0,
+        run_s: float = 0.0,
         *,
         tells_all: bool = False,
     ) -> None:
         self._show, self._tell, self._tells_all, self._sessions = show, tell, tells_all, sessions
-        self._least_ns = seconds_ns(max(_LEAST_S, _SHARE * night_s))
+        self._least_ns = to_ns(max(_LEAST_S, _SHARE * run_s))
         self._service: Served | None = None
         self._drift_px: Callable[[], float | None] = lambda: None
         self._session = ""
@@ -187,18 +197,20 @@ class RunFollower:
         hub.subscribe(self._follow)
 
     @asynccontextmanager
-    async def front(self, service: StandService, session: Path) -> AsyncGenerator[None]:
+    async def follow_service(self, service: StandService, session: Path) -> AsyncGenerator[None]:
         """Of a run in virtual time. No frame is looked at for its drift: that would take longer than the run."""
-        async with by_socket(service, session):
+        async with serve_by_socket(service, session):
             self._service = service
             yield
 
-    def front_at(self, interface: Interface, target_text: str) -> Front:
+    def make_front(self, interface: Interface, target_text: str) -> Front:
         """Of a run on the host's clock: all that the stand's file asks for."""
 
         @asynccontextmanager
         async def answering(service: StandService, session: Path) -> AsyncGenerator[None]:
-            async with front(service, session, service.stand, interface, target_text, service.patience) as viewing:
+            async with serve_interface(
+                service, session, service.stand, interface, target_text, service.shutdown_deadline
+            ) as viewing:
                 self._drift_px = viewing.drift_px
                 self._service = service
                 yield
@@ -208,43 +220,45 @@ class RunFollower:
     def _follow(self, item: Item) -> None:
         match item:
             case Event():
-                self._hear(item)
+                self._show_event(item)
             case StepMark():
                 self._next_ns = item.time_ns
             case Batch() if self._service is not None and item.time_ns >= self._next_ns:
                 self._next_ns = item.time_ns + self._least_ns
-                self._show(moment_of(self._service.state(), self._drift_px()))
+                self._show(make_snapshot(self._service.state(), self._drift_px()))
             case _:
                 pass
 
-    def _hear(self, event: Event) -> None:
+    def _show_event(self, event: Event) -> None:
         if event.kind in RUN_BEGINS:
             self._session = str(self._sessions / str(event.data.get("session")))
         if event.kind in (HELD, RELEASED):
             self._next_ns = event.time_ns
         if event.level != "info" or self._tells_all:
             offset_ns = 0 if self._service is None else utc_offset_ns(self._service.clock)
-            self._tell(event_line({**asdict(event), "utc_offset_ns": offset_ns}, self._session))
+            self._tell(format_event({**asdict(event), "utc_offset_ns": offset_ns}, self._session))
 
 
 @contextmanager
-def followed(night: Night, sessions: Path, *, is_virtual: bool) -> Generator[RunFollower]:
+def follow_run(estimate: PlanEstimate, sessions: Path, *, is_virtual: bool) -> Generator[RunFollower]:
     """What shows a run of this process while inside, by a thread of its own, for which the run never waits. sessions:
     the folder of its session's."""
-    with view(is_virtual=is_virtual) as shown, aside() as later:
-        yield RunFollower(later(shown.show), later(shown.tell), sessions, night.duration_s, tells_all=output().verbose)
+    with open_view(is_virtual=is_virtual) as shown, open_background_output() as later:
+        yield RunFollower(
+            later(shown.show), later(shown.tell), sessions, estimate.duration_s, tells_all=get_output().verbose
+        )
 
 
 class Silent:
     """Errors only."""
 
-    def show(self, moment: ShownMoment) -> None:
+    def show(self, moment: StatusSnapshot) -> None:
         """Nothing."""
 
     def tell(self, line: str) -> None:
         """An error at once."""
         if line.startswith("error"):
-            typer.echo(one_line(line), err=True)
+            typer.echo(escape_line(line), err=True)
 
 
 class PlainLines:
@@ -256,7 +270,7 @@ class PlainLines:
         self._next_ns = 0
         self._next_share = _TENTH
 
-    def show(self, moment: ShownMoment) -> None:
+    def show(self, moment: StatusSnapshot) -> None:
         """When it is time for one."""
         if self._is_virtual:
             share = moment.share or 0.0
@@ -269,23 +283,23 @@ class PlainLines:
             if now_ns < self._next_ns:
                 return
             self._next_ns = now_ns + _BETWEEN_LINES_NS
-        typer.echo(plain_line(moment), err=True)
+        typer.echo(format_line(moment), err=True)
 
     def tell(self, line: str) -> None:
         """At once."""
-        typer.echo(one_line(line), err=True)
+        typer.echo(escape_line(line), err=True)
 
 
-class Foot:
+class TerminalPanel:
     """The panel at the foot of a terminal; its last moment stays there when it ends."""
 
     def __init__(self, live: Live, clock: Now) -> None:
         self._live = live
         self._clock = clock
         self._next_ns = 0
-        self._last: ShownMoment | None = None
+        self._last: StatusSnapshot | None = None
 
-    def show(self, moment: ShownMoment) -> None:
+    def show(self, moment: StatusSnapshot) -> None:
         """Four times a second at the most."""
         self._last = moment
         if (now_ns := self._clock.now_ns()) >= self._next_ns:
@@ -296,23 +310,23 @@ class Foot:
         """Now."""
         if self._last is None:
             return
-        text = Text("\n".join(panel_lines(self._last)), no_wrap=True, overflow="ellipsis")
-        title, style = Text(one_line(self._last.title)), "yellow" if self._last.held else "none"
+        text = Text("\n".join(format_panel(self._last)), no_wrap=True, overflow="ellipsis")
+        title, style = Text(escape_line(self._last.title)), "yellow" if self._last.held else "none"
         self._live.update(Panel(text, title=title, title_align="left", border_style=style), refresh=True)
 
     def tell(self, line: str) -> None:
         """Above the panel."""
         style = "red" if line.startswith("error") else "yellow" if line.startswith("warning") else ""
-        self._live.console.print(Text(one_line(line), style=style), soft_wrap=True)
+        self._live.console.print(Text(escape_line(line), style=style), soft_wrap=True)
 
 
-View = Silent | PlainLines | Foot  # each shows moments as often as it likes, and every message at once
+View = Silent | PlainLines | TerminalPanel  # each shows moments as often as it likes, and every message at once
 
 
 @contextmanager
-def _foot(clock: Now) -> Generator[Foot]:
+def _open_panel(clock: Now) -> Generator[TerminalPanel]:
     console = Console(stderr=True, highlight=False)
     with Live(console=console, auto_refresh=False, redirect_stdout=False) as live:
-        foot = Foot(live, clock)
+        foot = TerminalPanel(live, clock)
         yield foot
         foot.draw()

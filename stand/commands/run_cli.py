@@ -15,24 +15,24 @@ import typer
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.exit_codes import NOT_REPORTED
-from thermostand.foundation.output import output, say, show
-from thermostand.foundation.usage import failed
-from thermostand.recording.repair.salvage import salvage_line
+from thermostand.foundation.output import get_output, say, show
+from thermostand.foundation.usage import report_failure
+from thermostand.recording.repair.salvage import format_salvaged
 from thermostand.stand.commands.checked_cli import warn_unchecked
-from thermostand.stand.commands.live import followed
-from thermostand.stand.commands.reached import ConfigOption, RecipeArgument, TokenOption, UrlOption
-from thermostand.stand.commands.submitted import daemon_of, follow, submit, submit_recipe, submit_resumed
-from thermostand.stand.config.checked import load_checked
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.estimating.learned import learn
-from thermostand.stand.estimating.run_estimate import existing, price_night, small_disk
+from thermostand.stand.commands.endpoint import ConfigOption, RecipeArgument, TokenOption, UrlOption
+from thermostand.stand.commands.live import follow_run
+from thermostand.stand.commands.submission import find_daemon, follow, submit, submit_recipe, submit_resume
+from thermostand.stand.config.check_record import load_check_record
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.estimating.learned_durations import learn_durations
+from thermostand.stand.estimating.run_estimate import estimate_plan, explain_small_disk, find_existing
 from thermostand.stand.running.order import load_order
-from thermostand.stand.running.resume import interruption, is_of_virtual_time
+from thermostand.stand.running.resume import is_of_virtual_time, load_interruption
 from thermostand.stand.running.session_report import REPORT_NAME, NotReported, check_reportable, report_session
 from thermostand.stand.service.run import resume, run_real, run_virtual
-from thermostand.stand.serving.client import Server, server_at
-from thermostand.stand.serving.desk import QueuedRun
-from thermostand.stand.serving.front import interface_of
+from thermostand.stand.serving.api_models import QueuedRun
+from thermostand.stand.serving.client import Server, make_server
+from thermostand.stand.serving.interface import make_interface
 
 app = App()
 
@@ -56,11 +56,11 @@ def demo(
     Example: stand demo --out /tmp/demo
     """
     order = load_order("demo", "simulated")
-    directory = _unused(out)
+    directory = _find_unused_path(out)
     _check_writable(directory)
-    night = price_night(tuple(order.recipe.plan()), order.config, directory)
-    with followed(night, directory, is_virtual=True) as shown:
-        session = asyncio.run(run_virtual(order, directory, None, shown.watch, front=shown.front))
+    estimate = estimate_plan(tuple(order.recipe.plan()), order.config, directory)
+    with follow_run(estimate, directory, is_virtual=True) as shown:
+        session = asyncio.run(run_virtual(order, directory, None, shown.watch, front=shown.follow_service))
     _show_session(session, directory, f"session  {session}", report=True)
 
 
@@ -90,37 +90,37 @@ def run(
     Example: stand run thermal-cycle --config laboratory.yaml --out /data/sessions --report
     """
     if url:
-        _check_elsewhere({"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report})
-        there = server_at(url, token_file)
-        return _follow(there, submit_recipe(there, recipe, attended=attended), detach=detach, report=False)
+        _check_remote_options({"--virtual-time": virtual_time, "--seed": seed, "--out": out, "--report": report})
+        remote = make_server(url, token_file)
+        return _follow(remote, submit_recipe(remote, recipe, attended=attended), detach=detach, report=False)
     _check_seed(seed, virtual_time=virtual_time)
     order = replace(load_order(recipe, config), attended=attended)
     if report:
         check_reportable(order.recipe.plan())
     if not virtual_time:
-        path = packaged("", config)
-        warn_unchecked(path, order.config, load_checked(path))
-    if not virtual_time and (server := daemon_of(order.config)) is not None:
+        path = find_packaged("", config)
+        warn_unchecked(path, order.config, load_check_record(path))
+    if not virtual_time and (server := find_daemon(order.config)) is not None:
         return _follow(server, submit(server, order, out), detach=detach, report=report)
     if detach:
         raise ConfigError("--detach: no `stand serve` has this stand, and a run by itself ends with its command")
     directory = out or order.config.recording.directory
     _check_writable(directory)
-    night = price_night(tuple(order.recipe.plan()), order.config, directory)
-    if lack := small_disk(directory, night.steps, order.config):
+    estimate = estimate_plan(tuple(order.recipe.plan()), order.config, directory)
+    if lack := explain_small_disk(directory, estimate.steps, order.config):
         say(f"warning: {directory}: {lack}")
-    interface = None if virtual_time else interface_of(order.config, directory)
-    with followed(night, directory, is_virtual=virtual_time) as shown:
+    interface = None if virtual_time else make_interface(order.config, directory)
+    with follow_run(estimate, directory, is_virtual=virtual_time) as shown:
         if interface is None:
-            work = run_virtual(order, directory, seed, shown.watch, front=shown.front)
+            work = run_virtual(order, directory, seed, shown.watch, front=shown.follow_service)
         else:
-            front = shown.front_at(interface, order.target_text)
+            front = shown.make_front(interface, order.target_text)
             work = run_real(order, directory, shown.watch, front=front)
         session = asyncio.run(work)
-    _finished(session, order.config, report=report)
+    _finish(session, order.config, report=report)
 
 
-def _check_elsewhere(given: Mapping[str, object]) -> None:
+def _check_remote_options(given: Mapping[str, object]) -> None:
     """ConfigError when an option is given that a run at a stand elsewhere has no use for."""
     if name := next((name for name, value in given.items() if not (value is None or value is False)), ""):
         raise ConfigError(f"{name} is for a run of this machine; leave it out, or --url")
@@ -150,33 +150,33 @@ def resume_run(
 
     Example: stand resume sessions/20260101T180000Z-thermal-cycle --config laboratory.yaml
     """
-    before = interruption(directory, load_config(packaged("", config)), reset=reset)
+    before = load_interruption(directory, load_config(find_packaged("", config)), reset=reset)
     order = replace(before.order, attended=attended)
     before = replace(before, order=order)
     try:
         if report:
             check_reportable(order.recipe.plan())
         for segment in before.salvaged:
-            typer.echo(salvage_line(segment), err=True)
-        night = price_night(before.state.plan, order.config, before.directory.parent)
+            typer.echo(format_salvaged(segment), err=True)
+        estimate = estimate_plan(before.state.plan, order.config, before.directory.parent)
     except BaseException:
         before.release()
         raise
     is_virtual = is_of_virtual_time(before)
-    if not is_virtual and (server := daemon_of(order.config)) is not None:
+    if not is_virtual and (server := find_daemon(order.config)) is not None:
         before.release()
-        _resume_there(server, directory, attended=attended, report=report)
+        _resume_remotely(server, directory, attended=attended, report=report)
         return
     sessions = directory.parent
     try:
-        interface = None if is_virtual else interface_of(order.config, sessions)
+        interface = None if is_virtual else make_interface(order.config, sessions)
     except BaseException:
         before.release()
         raise
-    with followed(night, sessions, is_virtual=is_virtual) as shown:
-        front = shown.front if interface is None else shown.front_at(interface, order.target_text)
+    with follow_run(estimate, sessions, is_virtual=is_virtual) as shown:
+        front = shown.follow_service if interface is None else shown.make_front(interface, order.target_text)
         session = asyncio.run(resume(before, shown.watch, front=front))
-    _finished(session, order.config, report=report)
+    _finish(session, order.config, report=report)
 
 
 def _follow(server: Server, submitted: QueuedRun, *, detach: bool, report: bool) -> None:
@@ -188,18 +188,18 @@ def _follow(server: Server, submitted: QueuedRun, *, detach: bool, report: bool)
     _show_session(session, session, str(session), report=report)
 
 
-def _resume_there(server: Server, directory: Path, *, attended: bool, report: bool) -> None:
+def _resume_remotely(server: Server, directory: Path, *, attended: bool, report: bool) -> None:
     """By the daemon that has the stand."""
     if attended:
         raise ConfigError("--attended: `stand serve` has this stand, and resumes a run as it was queued; leave it out")
-    session = follow(server, submit_resumed(server, directory))
+    session = follow(server, submit_resume(server, directory))
     _show_session(session, session, str(session), report=report)
 
 
-def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
+def _finish(session: Path, config: StandConfig, *, report: bool) -> None:
     """What follows a complete run: the next plan's durations, its folder printed, its report."""
     try:
-        learn(session.parent, config)
+        learn_durations(session.parent, config)
     except (SessionError, OSError) as error:  # what cannot be kept is no reason for a run to fail
         say(f"warning: {error}")
     _show_session(session, session, str(session), report=report)
@@ -208,18 +208,18 @@ def _finished(session: Path, config: StandConfig, *, report: bool) -> None:
 def _show_session(session: Path, folder: Path, line: str, *, report: bool) -> None:
     """The session, and when asked for its report's lines; status NOT_REPORTED when there is none: the run itself has
     gone well."""
-    if not output().as_json:
+    if not get_output().as_json:
         typer.echo(line)  # before the report, which takes a minute
     try:
         lines = report_session(session, folder).lines if report else []
         show({"session": session, "report": folder / REPORT_NAME if report else None}, lines)
     except NotReported as error:
-        if output().as_json:
+        if get_output().as_json:
             show({"session": session, "report": None, "error": str(error)}, ())
-        raise failed(error, NOT_REPORTED) from error
+        raise report_failure(error, NOT_REPORTED) from error
 
 
-def _unused(out: Path) -> Path:
+def _find_unused_path(out: Path) -> Path:
     """`out`, or `out-2`, `out-3` ... when it exists: a second demo never touches the first."""
     if not out.name:
         raise ConfigError(f"--out {out}: a demo needs a folder of its own name")
@@ -230,6 +230,6 @@ def _unused(out: Path) -> Path:
 def _check_writable(directory: Path) -> None:
     """ConfigError when no session could be made below `directory`: to be raised before anything is opened."""
     try:
-        Path(tempfile.mkdtemp(prefix=".writable-", dir=existing(directory))).rmdir()
+        Path(tempfile.mkdtemp(prefix=".writable-", dir=find_existing(directory))).rmdir()
     except OSError as error:
         raise ConfigError(f"{directory}: no session can be written there ({error.strerror})") from error

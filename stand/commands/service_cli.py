@@ -13,12 +13,12 @@ import typer
 
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.files import write_whole
+from thermostand.foundation.files import write_atomically
 from thermostand.foundation.output import say, show
-from thermostand.stand.commands.reached import ConfigArgument, ConfigOrOption, named_config
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.commands.endpoint import ConfigArgument, ConfigOrOption, choose_config
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.latch import SYSTEM_FOLDER
-from thermostand.stand.serving.presence import STANDS_FOLDER
+from thermostand.stand.serving.instances import STANDS_FOLDER
 
 app = App()
 
@@ -50,46 +50,46 @@ def install(
 
     Example: sudo stand service install laboratory.yaml --user operator --yes
     """
-    path = packaged("", named_config(configuration, by_option, default="")).absolute()
+    path = find_packaged("", choose_config(configuration, by_option, default="")).absolute()
     stand = load_config(path)
     name = user or os.environ.get("SUDO_USER") or os.environ.get("USER") or "root"
     for option, value in (("--user", name), ("--group", group or name)):
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,31}", value):
             raise ConfigError(f"{option} {value}: expected the name of a {option.strip('-')}")
     files = {
-        root / UNITS / f"{unit_name(stand)}.service": unit(path, stand, name, port),
-        root / RULES: rules(name),
-        root / FOLDERS: folders(group or name),
+        root / UNITS / f"{make_unit_name(stand)}.service": make_unit(path, stand, name, port),
+        root / RULES: make_udev_rules(name),
+        root / FOLDERS: make_tmpfiles(group or name),
     }
-    show({"files": {str(file): text for file, text in files.items()}, "written": yes}, _shown(files))
+    show({"files": {str(file): text for file, text in files.items()}, "written": yes}, _format_files(files))
     if not yes:
         say("nothing was written; --yes writes these files")
         return
     for file, text in files.items():
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file, text)
+        write_atomically(file, text)
     say(
-        f"written; now: systemctl daemon-reload && systemctl enable --now {unit_name(stand)}; "
+        f"written; now: systemctl daemon-reload && systemctl enable --now {make_unit_name(stand)}; "
         f"udevadm control --reload && udevadm trigger; systemd-tmpfiles --create {root / FOLDERS}"
     )
 
 
-def _shown(files: Mapping[Path, str]) -> Iterator[str]:
+def _format_files(files: Mapping[Path, str]) -> Iterator[str]:
     for file, text in files.items():
         yield f"# {file}\n{text}"
 
 
-def unit_name(stand: StandConfig) -> str:
+def make_unit_name(stand: StandConfig) -> str:
     """Of the service."""
     return f"thermostand-{re.sub(r'[^A-Za-z0-9_.-]+', '-', stand.name)}"
 
 
-def unit(config: Path, stand: StandConfig, user: str, port: int | None) -> str:
+def make_unit(config: Path, stand: StandConfig, user: str, port: int | None) -> str:
     """The unit: restarted when it dies, watched, and given the time that making safe takes."""
     arguments = [sys.executable, "-m", "thermostand.stand.cli", "serve", str(config)]
     arguments += [] if port is None else ["--port", str(port)]
     return f"""[Unit]
-Description=Thermal stand {_of_unit(stand.name)}
+Description=Thermal stand {_escape_unit(stand.name)}
 After=network-online.target time-sync.target
 Wants=network-online.target
 
@@ -97,8 +97,8 @@ Wants=network-online.target
 Type=notify
 NotifyAccess=main
 User={user}
-WorkingDirectory={_of_unit(str(config.parent))}
-ExecStart={" ".join(map(_quoted, arguments))}
+WorkingDirectory={_escape_unit(str(config.parent))}
+ExecStart={" ".join(map(_quote, arguments))}
 # The tokens of the network are read again.
 ExecReload=/bin/kill -HUP $MAINPID
 Restart=on-failure
@@ -115,7 +115,7 @@ Nice=-5
 NoNewPrivileges=yes
 CapabilityBoundingSet=
 ProtectSystem=full
-ReadWritePaths={_of_unit(str(config.parent))}
+ReadWritePaths={_escape_unit(str(config.parent))}
 PrivateTmp=yes
 ProtectKernelTunables=yes
 ProtectKernelModules=yes
@@ -128,7 +128,7 @@ WantedBy=multi-user.target
 """
 
 
-def rules(user: str) -> str:
+def make_udev_rules(user: str) -> str:
     """The flap's USB controller and the stages' serial ports belong to the user; stages keep a name of their own.
     ModemManager, which asks each new serial port for a modem by AT commands, leaves them alone."""
     ignored = 'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"'
@@ -143,7 +143,7 @@ SUBSYSTEM=="tty", SUBSYSTEMS=="usb", OWNER="{user}", MODE="0660", {ignored}
 """
 
 
-def folders(group: str) -> str:
+def make_tmpfiles(group: str) -> str:
     """Where the locks of this machine's stands lie (presence.lock_folder)."""
     return f"""# The locks of stands: only their operators may take one
 d {STANDS_FOLDER} 2770 root {group} -
@@ -152,11 +152,11 @@ d {SYSTEM_FOLDER} 2770 root {group} -
 """
 
 
-def _quoted(argument: str) -> str:
+def _quote(argument: str) -> str:
     """As systemd reads a command line."""
-    return f'"{_of_unit(argument)}"' if re.search(r"[\s\"'\\]", argument) else _of_unit(argument)
+    return f'"{_escape_unit(argument)}"' if re.search(r"[\s\"'\\]", argument) else _escape_unit(argument)
 
 
-def _of_unit(text: str) -> str:
+def _escape_unit(text: str) -> str:
     """Percent signs are specifiers there, and a dollar begins a variable."""
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$").replace("\n", " ")

@@ -10,8 +10,8 @@ import typer
 
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.output import output, say, show
-from thermostand.stand.commands.reached import ConfigOption, DirectoryArgument, reached
+from thermostand.foundation.output import get_output, say, show
+from thermostand.stand.commands.endpoint import ConfigOption, DirectoryArgument, find_server
 from thermostand.stand.serving.client import API, Answer
 
 app = App(
@@ -35,9 +35,9 @@ def add(
     """
     from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
 
-    path = _file(config)
+    path = _get_token_file(config)
     known = load_tokens(path) if path.expanduser().exists() else TokenFile()
-    if name in known.by_name():
+    if name in known.list_by_name():
         raise ConfigError(f"{path}: {name} has a token already; `stand token remove {name}` first")
     token = secrets.token_urlsafe(_BYTES)
     kind = "read_only" if read_only else "tokens"
@@ -47,7 +47,7 @@ def add(
         raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
     write_tokens(path, added)
     show({"name": name, "token": token, "read_only": read_only}, [token])
-    _say_when("knows it")
+    _print_activation("knows it")
 
 
 @app.command("list")
@@ -58,7 +58,10 @@ def list_names(config: ConfigOption = "simulated") -> None:
     """
     from thermostand.stand.config.interface_section import load_tokens
 
-    found = [(name, read_only) for name, (_, read_only) in sorted(load_tokens(_file(config)).by_name().items())]
+    found = [
+        (name, read_only)
+        for name, (_, read_only) in sorted(load_tokens(_get_token_file(config)).list_by_name().items())
+    ]
     lines = [f"{name}  read-only" if read_only else name for name, read_only in found]
     show([{"name": name, "read_only": read_only} for name, read_only in found], lines)
 
@@ -71,13 +74,13 @@ def remove(name: NameArgument, config: ConfigOption = "simulated") -> None:
     """
     from thermostand.stand.config.interface_section import load_tokens, write_tokens
 
-    path = _file(config)
+    path = _get_token_file(config)
     known = load_tokens(path)
-    if name not in known.by_name():
+    if name not in known.list_by_name():
         raise ConfigError(f"{path}: {name} has no token; `stand token list` shows who has")
-    write_tokens(path, known.without(name))
+    write_tokens(path, known.drop_token(name))
     show({"removed": name}, ())
-    _say_when("forgets it, and disconnects who has it")
+    _print_activation("forgets it, and disconnects who has it")
 
 
 @app.command()
@@ -90,22 +93,22 @@ def login(
 
     Example: stand token login
     """
-    server = reached(directory, config, anywhere=True)
+    server = find_server(directory, config, anywhere=True)
     answer = cast("Answer", server.request("POST", f"{API}/login", {"read_only": read_only}))
-    if not answer["url"] and not output().as_json:
+    if not answer["url"] and not get_output().as_json:
         raise ConfigError(f"{server.name}: its daemon does not listen to the network; start it with --port")
     show(answer, [str(answer["url"])])
 
 
-def _say_when(what: str) -> None:
+def _print_activation(what: str) -> None:
     """How a daemon learns of it. No signal is sent from here: for `stand run`, which reads them once, it is an end."""
     say(f"a running `stand serve` {what} at SIGHUP (`systemctl reload` of its unit, or kill -HUP), or its next start")
 
 
-def _file(config: str) -> Path:
-    from thermostand.stand.config.stand_config import load_config, packaged
+def _get_token_file(config: str) -> Path:
+    from thermostand.stand.config.stand_config import find_packaged, load_config
 
-    stand = load_config(packaged("", config))
+    stand = load_config(find_packaged("", config))
     if stand.interface.secrets is None:
         raise ConfigError(
             f"{config}: has no interface.secrets; name a file for the tokens there (docs/how-to/open-to-the-network.md)"

@@ -12,26 +12,26 @@ import typer
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from thermostand.foundation.command_app import App, with_parameters
+from thermostand.foundation.command_app import App, add_parameters
 from thermostand.foundation.documents import read_document
 from thermostand.foundation.output import show
-from thermostand.foundation.usage import one_line
-from thermostand.stand.commands.reached import OPTIONS, DirectoryArgument, reached
+from thermostand.foundation.usage import escape_line
+from thermostand.stand.commands.endpoint import OPTIONS, DirectoryArgument, find_server
 from thermostand.stand.service.stand_service import StandService
+from thermostand.stand.serving.api_models import Done
 from thermostand.stand.serving.client import API, Answer, Server
-from thermostand.stand.serving.commands import STOP, Command, Served, Typed, commands_of
-from thermostand.stand.serving.desk import Done
+from thermostand.stand.serving.commands import STOP, Command, Served, Typed, collect_commands
 
 _LIMIT_S = 60.0  # what a command waits for: a device may move, or the stand's wires be asked
 
 
-def app_of(service: type[Served], group: str = "", help_text: str | None = None) -> App:
+def make_app(service: type[Served], group: str = "", help_text: str | None = None) -> App:
     """The command line of a service, of the verbs that stand behind `group`, such as `queue`."""
     app = App(help_text, no_args_is_help=bool(group))
-    for each in commands_of(service).values():
+    for each in collect_commands(service).values():
         for words in (verb.split() for verb in each.verbs or ()):
             if words[:-1] == group.split():
-                app.command(words[-1])(_verb(each))
+                app.command(words[-1])(_make_verb(each))
     return app
 
 
@@ -48,67 +48,67 @@ def order(server: Server, name: str, **given: object) -> Answer:
     return ask(server, COMMANDS[name], **given)
 
 
-def recipe_of(recipe: str) -> dict[str, object]:
+def make_recipe_request(recipe: str) -> dict[str, object]:
     """What asks for a recipe: a file's as it is now, or an installed one."""
-    typed = _typed("recipe", _fields(COMMANDS["submit"])["recipe"])
-    return dict([_field("recipe", typed, recipe)])
+    typed = _get_typed("recipe", _list_fields(COMMANDS["submit"])["recipe"])
+    return dict([_get_field("recipe", typed, recipe)])
 
 
-def _verb(command: Command) -> Callable[..., None]:
-    fields = _fields(command)
-    typed = {name: shown for name, info in fields.items() if (shown := _typed(name, info)).name}
+def _make_verb(command: Command) -> Callable[..., None]:
+    fields = _list_fields(command)
+    typed = {name: shown for name, info in fields.items() if (shown := _get_typed(name, info)).name}
 
     def verb(**given: Any) -> None:
         place = (given.pop("directory"), given.pop("config"), given.pop("url"), given.pop("token_file"))
         values = dict(
-            _field(name, each, value)
+            _get_field(name, each, value)
             for name, each in typed.items()
-            if (value := _value(each, given[each.name])) not in (None, False, [])
+            if (value := _convert_value(each, given[each.name])) not in (None, False, [])
         )
-        server = reached(*place, anywhere=command.anywhere)
+        server = find_server(*place, anywhere=command.anywhere)
         answer = ask(server, command, **values)
-        show(answer, [_line(server, command, answer)])
+        show(answer, [_format_answer(server, command, answer)])
 
     verb.__name__, verb.__doc__ = command.method, command.text
-    parameters = {each.name: _option(fields[name], each) for name, each in typed.items()}
-    return with_parameters(verb, _nothing, {**parameters, "directory": (DirectoryArgument, None), **OPTIONS})
+    parameters = {each.name: _make_option(fields[name], each) for name, each in typed.items()}
+    return add_parameters(verb, _take_nothing, {**parameters, "directory": (DirectoryArgument, None), **OPTIONS})
 
 
-def _line(server: Server, command: Command, answer: Answer) -> str:
+def _format_answer(server: Server, command: Command, answer: Answer) -> str:
     """A sentence of what came of it; of what is queued its number, for programs."""
     if command.answer is not Done:
         return str(answer.get("id", ""))
-    moving = ", ".join(map(one_line, cast("list[str]", answer.get("moving", []))))
+    moving = ", ".join(map(escape_line, cast("list[str]", answer.get("moving", []))))
     text = str(answer.get("text") or command.name) + (f"; still moving: {moving}" if moving else "")
-    return f"{server.name}: {one_line(text)}"
+    return f"{server.name}: {escape_line(text)}"
 
 
-def _fields(command: Command) -> dict[str, FieldInfo]:
+def _list_fields(command: Command) -> dict[str, FieldInfo]:
     return {} if command.argument is None else cast("type[BaseModel]", command.argument).model_fields
 
 
-def _nothing() -> None:
+def _take_nothing() -> None:
     """All parameters are added to those of this one."""
 
 
-def _typed(name: str, info: FieldInfo) -> Typed:
+def _get_typed(name: str, info: FieldInfo) -> Typed:
     return next((each for each in info.metadata if isinstance(each, Typed)), Typed(name))
 
 
-def _value(typed: Typed, given: object) -> object:
+def _convert_value(typed: Typed, given: object) -> object:
     if typed.value is not None:
         return typed.value if given else None
     return float(str(given)) * typed.unit if typed.unit is not None and given is not None else given
 
 
-def _field(name: str, typed: Typed, value: object) -> tuple[str, object]:
+def _get_field(name: str, typed: Typed, value: object) -> tuple[str, object]:
     """Which field gets what."""
     if typed.text_in and (path := Path(str(value))).is_file():
         return typed.text_in, read_document(path)
     return name, value
 
 
-def _option(info: FieldInfo, typed: Typed) -> tuple[Any, object]:
+def _make_option(info: FieldInfo, typed: Typed) -> tuple[Any, object]:
     """How typer sees a field: what is required is an argument, all else an option."""
     help_text = typed.help or info.description or ""
     kind: Any = info.annotation
@@ -122,5 +122,5 @@ def _option(info: FieldInfo, typed: Typed) -> tuple[Any, object]:
     return Annotated[kind | None, typer.Option(help=help_text)], None
 
 
-COMMANDS = commands_of(StandService)
-app = app_of(StandService)
+COMMANDS = collect_commands(StandService)
+app = make_app(StandService)

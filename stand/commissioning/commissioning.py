@@ -16,15 +16,15 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, suppress
 from functools import partial
 
-from thermostand.drivers.devices.checking import Add, DeviceLook, Finding
+from thermostand.drivers.devices.device_check import Add, DeviceCheck, Finding
 from thermostand.drivers.devices.kinds import Equipment
 from thermostand.drivers.settings import Identity
 from thermostand.foundation.errors import DeviceError, InUse, Unreachable
-from thermostand.stand.assembly import Assembly, register_map
-from thermostand.stand.commissioning.moves import Moves
+from thermostand.stand.assembly import Assembly, load_unit_map
+from thermostand.stand.commissioning.moves import MovementChecks
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.estimating.run_estimate import existing
-from thermostand.stand.running.opening.open_stand import at_bench, made_safe
+from thermostand.stand.estimating.run_estimate import find_existing
+from thermostand.stand.running.opening.open_stand import make_safe, open_bench
 from thermostand.stand.running.opening.stop import Stop
 
 COMMAND = "stand check"
@@ -43,42 +43,42 @@ async def commission(
     found: list[Finding] = []
     async with AsyncExitStack() as stack:
         stop = await stack.enter_async_context(Stop())
-        assembly = await stack.enter_async_context(at_bench(config, COMMAND))
+        assembly = await stack.enter_async_context(open_bench(config, COMMAND))
         if has_moves:
-            stack.push_async_callback(_made_safe, assembly, stop, found, tell)
+            stack.push_async_callback(_make_safe, assembly, stop, found, tell)
             stop.watch(assembly.stand)
         reported = 0
-        async for _ in _looks(assembly, found.append, has_moves=has_moves):
+        async for _ in _check_devices(assembly, found.append, has_moves=has_moves):
             tell(tuple(found[reported:]))
             reported = len(found)
-        return tuple(found), _identities(assembly)
+        return tuple(found), _collect_identities(assembly)
 
 
-async def _looks(assembly: Assembly, add: Add, *, has_moves: bool) -> AsyncIterator[None]:
+async def _check_devices(assembly: Assembly, add: Add, *, has_moves: bool) -> AsyncIterator[None]:
     """Yields after each device."""
-    for finding in await asyncio.to_thread(_of_computer, assembly.config):
+    for finding in await asyncio.to_thread(_check_computer, assembly.config):
         add(finding)
     yield
     opened: set[str] = set()
-    moves = Moves(assembly, opened, add) if has_moves else None
+    moves = MovementChecks(assembly, opened, add) if has_moves else None
     is_bus_up = await _is_bus_up(assembly, add)
     yield
     for each in assembly.equipment:
         name, kind, settings = each
         device = assembly.devices.every[name]
         await kind.check(
-            DeviceLook(
+            DeviceCheck(
                 device=device,
                 settings=settings,
                 section=kind.section,
-                advise=partial(_advised, each),
+                advise=partial(_advise, each),
                 clock=assembly.clock,
                 modbus=assembly.bus,
                 is_bus_up=is_bus_up,
                 made=assembly.devices.every,
                 opened=opened,
                 of_section=partial(getattr, assembly.config),
-                map_of=register_map,
+                map_of=load_unit_map,
                 add=add,
                 is_powered_later=has_moves,
             )
@@ -91,7 +91,7 @@ async def _looks(assembly: Assembly, add: Add, *, has_moves: bool) -> AsyncItera
         yield
 
 
-def _advised(each: Equipment, error: DeviceError) -> str:
+def _advise(each: Equipment, error: DeviceError) -> str:
     return each.kind.advise(error, each.name, each.settings)
 
 
@@ -113,15 +113,15 @@ async def _is_bus_up(assembly: Assembly, add: Add) -> bool:
     return True
 
 
-async def _made_safe(assembly: Assembly, stop: Stop, found: list[Finding], tell: Tell) -> None:
+async def _make_safe(assembly: Assembly, stop: Stop, found: list[Finding], tell: Tell) -> None:
     """Everything that may have moved; a failure when it is not confirmed."""
-    if unsafe := await made_safe(assembly, stop):
+    if unsafe := await make_safe(assembly, stop):
         text = f"NOT SAFE: {'; '.join(unsafe)}"
         found.append(Finding("stand", "made safe", "failed", text, "look at the stand now"))
         tell((found[-1],))
 
 
-def _identities(assembly: Assembly) -> dict[str, Identity]:
+def _collect_identities(assembly: Assembly) -> dict[str, Identity]:
     """Of those that have answered."""
     known: dict[str, Identity] = {}
     for name, device in assembly.devices.every.items():
@@ -143,9 +143,9 @@ _TIMEX_BYTES = 208
 _ESTIMATE_AT, _MAXIMUM_AT = 32, 24  # of esterror and maxerror in struct timex, longs of us on 64-bit Linux
 
 
-def _disk(config: StandConfig) -> Finding:
+def _check_disk(config: StandConfig) -> Finding:
     """Write and flush beside the sessions, as a night does; blocking, up to some seconds."""
-    folder = existing(config.recording.directory)
+    folder = find_existing(config.recording.directory)
     piece, slowest_s, begin_s = os.urandom(_PIECE_BYTES), 0.0, time.perf_counter()
     try:
         with tempfile.TemporaryFile(dir=folder, prefix=".check-") as file:
@@ -160,7 +160,7 @@ def _disk(config: StandConfig) -> Finding:
         text = f"nothing can be written to {folder} ({error.strerror})"
         return Finding("disk", "speed", "failed", text, "give recording.directory a folder that this user may write to")
     speed_MB_s = _PIECES * _PIECE_BYTES / 1e6 / (time.perf_counter() - begin_s)
-    needed_MB_s = max(_LEAST_MB_s, _MARGIN * _frames_MB_s(config))
+    needed_MB_s = max(_LEAST_MB_s, _MARGIN * _compute_frames_MB_s(config))
     data: dict[str, object] = {
         "folder": str(folder),
         "speed_MB_s": round(speed_MB_s, 1),
@@ -177,7 +177,7 @@ def _disk(config: StandConfig) -> Finding:
     return Finding("disk", "speed", "ok", text, data=data)
 
 
-def _frames_MB_s(config: StandConfig) -> float:
+def _compute_frames_MB_s(config: StandConfig) -> float:
     sizes = (
         (camera.width_px * camera.height_px if camera.width_px and camera.height_px else _FRAME_BYTES)
         * camera.frame_rate_hz
@@ -186,7 +186,7 @@ def _frames_MB_s(config: StandConfig) -> float:
     return sum(sizes) / 1e6
 
 
-def _clock() -> Finding:
+def _check_clock() -> Finding:
     """Whether the kernel's clock follows a time server (adjtimex)."""
     timex = ctypes.create_string_buffer(_TIMEX_BYTES)
     try:
@@ -205,6 +205,6 @@ def _clock() -> Finding:
     return Finding("clock", "sync", "ok", f"follows a time server, within {maximum_s:.2g} s", data=data)
 
 
-def _of_computer(config: StandConfig) -> tuple[Finding, ...]:
+def _check_computer(config: StandConfig) -> tuple[Finding, ...]:
     """Disk and clock; blocking."""
-    return _disk(config), _clock()
+    return _check_disk(config), _check_clock()

@@ -8,12 +8,12 @@ from typing import cast
 
 from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.devices.cameras.camera_gige import Settings as GigeSettings
-from thermostand.drivers.wires import camera_dialects as words
+from thermostand.drivers.wires import genicam_feature_names as words
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.stand.config.simulation import SimulatedCamera
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 _NAME = "camera"
 _SET_BY = (*words.EXPOSURE, *words.EXPOSURE_STEP_US, *words.NECESSARY, "TriggerSoftware")
@@ -38,33 +38,33 @@ class Rehearsal:
 async def rehearse(file: Path, stand: StandConfig | None = None) -> Rehearsal:
     """Dress a simulated camera in the file, set it as the stand's first GigE camera (else as usual) and grab a frame.
     ConfigError when the file is no GenICam file."""
-    settings = _settings_of(stand)
-    simulated = load_config(packaged("", "simulated"))
+    settings = _get_settings(stand)
+    simulated = load_config(find_packaged("", "simulated"))
     if simulated.simulation is None:
         raise ValueError("the installed simulated stand has no simulation")
     simulation = simulated.simulation.model_copy(update={"cameras": {_NAME: SimulatedCamera(genicam=file)}})
     simulated = simulated.model_copy(update={"cameras": {_NAME: settings}, "simulation": simulation})
-    laboratory = laboratory_of(simulated, virtual=False, seed=None, is_anywhere=True)
+    laboratory = describe_laboratory(simulated, virtual=False, seed=None, is_anywhere=True)
     # nobody switches it on: without a relay board it has power
     devices = {
         name: each for name, each in cast("dict[str, object]", laboratory["devices"]).items() if name != "relays"
     }
     simulator = Simulator({**laboratory, "devices": devices, "camera_boot_s": 0.0})
     try:
-        unplayed = await _unplayed(simulator)
-        return await _opened(settings.model_copy(update={"address": simulator.addresses[_NAME]}), unplayed)
+        unplayed = await _list_unsupported_features(simulator)
+        return await _try_camera(settings.model_copy(update={"address": simulator.addresses[_NAME]}), unplayed)
     finally:
         simulator.stop()
 
 
-def _settings_of(stand: StandConfig | None) -> GigeSettings:
+def _get_settings(stand: StandConfig | None) -> GigeSettings:
     """Of the stand's first GigE camera, whatever its serial number; when there is none, such as each camera can."""
     cameras = () if stand is None else stand.cameras.values()
     first = next((each for each in cameras if isinstance(each, GigeSettings)), _ANY)
     return first.model_copy(update={"serial_number": None})
 
 
-async def _unplayed(simulator: Simulator) -> tuple[str, ...]:
+async def _list_unsupported_features(simulator: Simulator) -> tuple[str, ...]:
     """The features that the simulated camera cannot play, of those that a camera is set by."""
     control = ControlSocket(simulator.addresses["control"])
     await control.open()
@@ -75,7 +75,7 @@ async def _unplayed(simulator: Simulator) -> tuple[str, ...]:
     return tuple(map(str, cast("list[object]", answer[_NAME])))
 
 
-def _cannot_play(error: DeviceError, unplayed: tuple[str, ...]) -> str:
+def _explain_unsupported(error: DeviceError, unplayed: tuple[str, ...]) -> str:
     """Why what went wrong is the rehearsal's own, "" when it is the file's. A simulated camera that is understood
     always gives frames, and takes what its registers can hold."""
     missed = [name for name in unplayed if name in _SET_BY]
@@ -85,19 +85,19 @@ def _cannot_play(error: DeviceError, unplayed: tuple[str, ...]) -> str:
     return f"the rehearsal cannot play this file: {why}; that says nothing of the camera itself ({error.text})"
 
 
-async def _opened(settings: GigeSettings, unplayed: tuple[str, ...]) -> Rehearsal:
+async def _try_camera(settings: GigeSettings, unplayed: tuple[str, ...]) -> Rehearsal:
     camera = AravisCamera(_NAME, settings, WallClock())
     who = ""
     try:
         await camera.open()
         who = f"{camera.identity.vendor} {camera.identity.model}"
-        place = await camera.temperature_place() or "none"
+        place = await camera.describe_temperature_place() or "none"
         frame = await camera.grab()
         took = camera.effective
         size = f"{frame.image.shape[1]} x {frame.image.shape[0]} px, {took.pixel_format}, packets of {took.packet_size}"
         return Rehearsal(who, {**took.features, "temperature": place, "frame": size}, "", unplayed)
     except DeviceError as error:
-        own = _cannot_play(error, unplayed)
+        own = _explain_unsupported(error, unplayed)
         return Rehearsal(who, {}, own or str(error), unplayed, is_played=not own)
     finally:
         await camera.close()

@@ -10,7 +10,7 @@ from collections.abc import Awaitable
 from typing import cast
 
 from thermostand.drivers.devices.cameras.cameras_by_protocol import check_settings
-from thermostand.drivers.devices.checking import Add, Finding, identity_finding
+from thermostand.drivers.devices.device_check import Add, Finding, check_identity
 from thermostand.drivers.devices.kinds import Equipment
 from thermostand.drivers.devices.protocols import Actuator, Camera
 from thermostand.foundation.clock import NS_PER_S, Clock
@@ -25,7 +25,7 @@ _SLOW = 0.8  # of the longest travel that the stand's file allows
 _MOST_APART_K = 10.0  # a chamber so far from its laboratory keeps its flap shut
 
 
-class Moves:
+class MovementChecks:
     """Of the devices that answer, by their names in `opened`; each says what it found."""
 
     def __init__(self, assembly: Assembly, opened: set[str], add: Add) -> None:
@@ -41,13 +41,13 @@ class Moves:
         if each.name in self._opened and hasattr(device, "make_safe"):
             self._assembly.stand.opened(cast("Actuator", device))
         if each.kind.device == "regulator":
-            await self.heat_timer()
+            await self.check_heat_timer()
         elif device is self._assembly.devices.flap:
-            await self.flap()
+            await self.check_flap()
         elif each.name in self._assembly.devices.axes:
-            await self.axis(each.name)
+            await self.check_axis(each.name)
 
-    async def heat_timer(self) -> None:
+    async def check_heat_timer(self) -> None:
         """Does the board drop the heater's relay in time, and does a timed-on sent again start its time again?"""
         stand, devices = self._assembly.stand, self._assembly.devices
         name, what = devices.relays.name, "timed-on"
@@ -56,7 +56,7 @@ class Moves:
             self._add(Finding(name, what, "unverified", text, "mend them, and check again"))
             return
         try:
-            await stand.chamber.permits.withdraw_left_on()
+            await stand.chamber.permits.switch_off_left_on()
             await devices.regulator.stop()
             await stand.chamber.test_dead_man(is_timed=True)
         except StandTripped:
@@ -64,21 +64,21 @@ class Moves:
         except StandError as error:
             text = error.text if isinstance(error, DeviceError) else str(error)
             to_do = "nothing may be heated with it: take a board with a timer that re-arms, and look at the wiring"
-            self._add(Finding(name, what, "failed", text, to_do, self._last(DEAD_MAN_TESTED)))
+            self._add(Finding(name, what, "failed", text, to_do, self._find_last_event(DEAD_MAN_TESTED)))
             return
-        data = self._last(DEAD_MAN_TESTED)
+        data = self._find_last_event(DEAD_MAN_TESTED)
         if not devices.relays.has_timer:
             self._add(Finding(name, what, "ok", "no relay board, so none to be measured"))
             return
         text = f"a timed-on of {data.get('pulse_s')} s that was sent again held for {data.get('held_s')} s from then"
         self._add(Finding(name, what, "ok", text, data=data))
 
-    async def flap(self) -> None:
+    async def check_flap(self) -> None:
         """Open and close, each with its time."""
         name, flap = self._assembly.devices.flap.name, self._assembly.config.flap
         if flap is None or name not in self._opened:
             return
-        if apart_K := await self._chamber_apart_K():
+        if apart_K := await self._measure_offset_K():
             text = f"not moved: the chamber is {apart_K:+.0f} K from the laboratory"
             self._add(
                 Finding(name, "travel", "unverified", text, "check again when it is at the laboratory's temperature")
@@ -87,8 +87,8 @@ class Moves:
         imaging, clock, travel_s = self._assembly.stand.imaging, self._assembly.clock, flap.travel_s
         try:
             await imaging.close_flap()
-            open_s = await _timed(imaging.open_flap(), clock)
-            close_s = await _timed(imaging.close_flap(), clock)
+            open_s = await _measure_duration_s(imaging.open_flap(), clock)
+            close_s = await _measure_duration_s(imaging.close_flap(), clock)
         except Superseded:
             raise
         except DeviceError as error:
@@ -102,7 +102,7 @@ class Moves:
             return
         self._add(Finding(name, "travel", "ok", text, data=data))
 
-    async def axis(self, name: str) -> None:
+    async def check_axis(self, name: str) -> None:
         """Home; one that had a home before tells how far it was off, and goes back to where it was."""
         if name not in self._opened:
             return
@@ -110,7 +110,7 @@ class Moves:
         try:
             position, *_ = await axis.read()
             was_homed = await axis.homed()
-            took_s = await _timed(stand.table.check_home(name), self._assembly.clock)
+            took_s = await _measure_duration_s(stand.table.check_home(name), self._assembly.clock)
             low, high = self._assembly.config.axes[name].limits
             if was_homed and low <= position.value <= high:
                 await stand.table.move_to(name, position.value)
@@ -123,7 +123,7 @@ class Moves:
             text = f"homed in {took_s:.1f} s; it had no home before, so there is nothing to compare"
             self._add(Finding(name, "home", "ok", text, data={"took_s": took_s}))
             return
-        data = {**self._last(HOME_RESIDUAL, HOME_RESIDUAL_LARGE), "took_s": took_s}
+        data = {**self._find_last_event(HOME_RESIDUAL, HOME_RESIDUAL_LARGE), "took_s": took_s}
         text = f"its home was off by {data['residual']} {data['unit']} ({data['steps']} steps)"
         if any(event.kind == HOME_RESIDUAL_LARGE and event.data.get("axis") == name for event in self._events):
             to_do = "it has lost steps, or its switch moves: look at load, speed and switch, and check again"
@@ -138,12 +138,12 @@ class Moves:
         if not self._assembly.devices.cameras or self._assembly.devices.relays.name not in self._opened:
             return  # there are none, or that their relay does not answer was reported
         try:
-            await self._supplied_cameras()
+            await self._check_supplied_cameras()
         finally:
             if stand.imaging.supply.was_on is False:
                 stand.safety.take(stand.imaging.supply)
 
-    async def _supplied_cameras(self) -> None:
+    async def _check_supplied_cameras(self) -> None:
         devices, supply = self._assembly.devices, self._assembly.stand.imaging.supply
         try:
             await supply.switch_on()
@@ -157,13 +157,13 @@ class Moves:
         for name, camera in devices.cameras.items():
             if name not in self._opened:
                 self._opened.add(name)
-                self._add(identity_finding(camera))
+                self._add(check_identity(camera))
                 await check_settings(camera, self._add)
-            await self._frames(name, camera)
+            await self._check_frames(name, camera)
         if supply.was_on is False:
             await supply.switch_off()
 
-    async def _frames(self, name: str, camera: Camera) -> None:
+    async def _check_frames(self, name: str, camera: Camera) -> None:
         wanted_hz = camera.settings.frame_rate_hz
         try:
             first = await camera.grab()  # starts the acquisition
@@ -195,7 +195,7 @@ class Moves:
             to_do = "say where it is in cameras.NAME.temperature, or has_temperature: false"
             self._add(Finding(name, "temperature", "failed", temperature.reason, to_do))
 
-    async def _chamber_apart_K(self) -> float:
+    async def _measure_offset_K(self) -> float:
         """How far the chamber's air is from the laboratory; 0 when it is near, or not known."""
         devices = self._assembly.devices
         if devices.thermometers.name not in self._opened:
@@ -218,12 +218,12 @@ class Moves:
         if isinstance(item, Event):
             self._events.append(item)
 
-    def _last(self, *kinds: str) -> dict[str, object]:
+    def _find_last_event(self, *kinds: str) -> dict[str, object]:
         """The data of the last such event."""
         return next((dict(event.data) for event in reversed(self._events) if event.kind in kinds), {})
 
 
-async def _timed(work: Awaitable[object], clock: Clock) -> float:
+async def _measure_duration_s(work: Awaitable[object], clock: Clock) -> float:
     begin_ns = clock.now_ns()
     await work
     return round((clock.now_ns() - begin_ns) / NS_PER_S, 2)

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from thermostand.foundation.documents import Document
 from thermostand.foundation.events import AlertCause
-from thermostand.stand.config.private_file import private_document
+from thermostand.stand.config.private_file import load_private_document
 
 
 class AlertsConfig(Document):
@@ -40,6 +40,6 @@ class AlertSecrets(Document):
 
 
 def load_secrets(path: Path) -> AlertSecrets:
-    """ConfigError as private_document."""
+    """ConfigError as load_private_document."""
     form = "`urls:` with a list of Apprise's addresses, and `alive_url:` with an http address"
-    return private_document(path, "alerts.secrets", AlertSecrets, form)
+    return load_private_document(path, "alerts.secrets", AlertSecrets, form)

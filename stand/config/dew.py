@@ -14,7 +14,7 @@ from thermostand.foundation.documents import Document
 _A, _B_degC = 17.62, 243.12
 
 
-def dew_point_degC(air_degC: float, humidity_percent: float) -> float:
+def compute_dew_point_degC(air_degC: float, humidity_percent: float) -> float:
     """Of air at that temperature and relative humidity (above 0); NaN when either is."""
     if math.isnan(air_degC) or math.isnan(humidity_percent):
         return math.nan
@@ -36,7 +36,7 @@ class DewConfig(Document):
     flap_s: float = Field(default=10.0, ge=0, le=300)
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> Self:
+    def _check_one_source(self) -> Self:
         if (self.dew_point_degC is None) == (self.humidity_percent is None):
             raise ValueError("give dew_point_degC or humidity_percent, one of them")
         return self
@@ -48,7 +48,7 @@ class DewConfig(Document):
             return measured_degC + self.margin_K
         if self.dew_point_degC is not None:
             return self.dew_point_degC + self.margin_K
-        return dew_point_degC(laboratory_degC, self.humidity_percent or math.nan) + self.margin_K
+        return compute_dew_point_degC(laboratory_degC, self.humidity_percent or math.nan) + self.margin_K
 
 
 class EndingConfig(Document):

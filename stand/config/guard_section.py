@@ -7,7 +7,6 @@ from typing import Literal, Self
 from pydantic import Field, SerializeAsAny, field_validator, model_validator
 
 from thermostand.foundation.documents import Document
-from thermostand.stand.config.added_rules import added_rules
 from thermostand.stand.config.chamber_section import (
     CameraCrosscheckConfig,
     GraniteCrosscheckConfig,
@@ -15,6 +14,7 @@ from thermostand.stand.config.chamber_section import (
     StartupResponseConfig,
     SteadyStatePowerConfig,
 )
+from thermostand.stand.config.guard_rule_plugins import load_rule_settings
 
 
 class HeaterOffConfig(Document):
@@ -50,7 +50,7 @@ class SensorsConfig(Document):
     drift_K: float = Field(default=0.1, gt=0, le=5)
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_order(self) -> Self:
         if self.warn_K > self.trip_K:
             raise ValueError(f"warn_K {self.warn_K} is above trip_K {self.trip_K}")
         return self
@@ -126,10 +126,10 @@ class GuardConfig(Document):
     # Round number; nothing was measured.
     safe_limit_s: float = Field(default=600.0, ge=1, le=3600)
 
-    _added = field_validator("added", mode="before")(added_rules)
+    _added = field_validator("added", mode="before")(load_rule_settings)
 
     @model_validator(mode="after")
-    def _renewed_in_time(self) -> Self:
+    def _check_renewal(self) -> Self:
         if self.heater_renew_s * 2 > self.heater_hold_s:
             raise ValueError("heater_renew_s must be at most half of heater_hold_s, or one lost command cuts the heat")
         if self.period_s + self.heater_renew_s >= self.heater_hold_s:  # renewals fall on the guard's own looks

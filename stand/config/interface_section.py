@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import make_durable_folder, sync_folder
-from thermostand.stand.config.private_file import private_document
+from thermostand.stand.config.private_file import load_private_document
 
 TokenName = Annotated[str, Field(pattern=r"^[\w.@-]{1,64}$")]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:-]{1,253}$")]
@@ -46,19 +46,19 @@ class TokenFile(Document):
     read_only: dict[TokenName, Token] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _each_once(self) -> TokenFile:
+    def _check_unique(self) -> TokenFile:
         if self.tokens.keys() & self.read_only.keys():
             raise ValueError("a name has one token")
         if len({*self.tokens.values(), *self.read_only.values()}) < len(self.tokens) + len(self.read_only):
             raise ValueError("a token has one name")
         return self
 
-    def by_name(self) -> dict[str, tuple[str, bool]]:
+    def list_by_name(self) -> dict[str, tuple[str, bool]]:
         """The token of each name, and whether it is read-only."""
         writing = {name: (token, False) for name, token in self.tokens.items()}
         return writing | {name: (token, True) for name, token in self.read_only.items()}
 
-    def without(self, name: str) -> TokenFile:
+    def drop_token(self, name: str) -> TokenFile:
         """The same but for the token of that name."""
         return TokenFile.model_validate(
             {key: {n: token for n, token in of.items() if n != name} for key, of in self.model_dump().items()}
@@ -66,9 +66,9 @@ class TokenFile(Document):
 
 
 def load_tokens(path: Path) -> TokenFile:
-    """ConfigError as private_document."""
+    """ConfigError as load_private_document."""
     form = "`tokens:` and `read_only:`, with a token of at least 20 characters for each name, each name and token once"
-    return private_document(path, "interface.secrets", TokenFile, form)
+    return load_private_document(path, "interface.secrets", TokenFile, form)
 
 
 def write_tokens(path: Path, tokens: TokenFile) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.config.stand_config import Folder, packaged
+from thermostand.stand.config.stand_config import Folder, find_packaged
 
 _SCHEMA = re.compile(r"\$schema=\S+/([a-z-]+\.json)")
 _README = """\
@@ -45,55 +45,59 @@ class Connected:
     axes: Sequence[ConnectedAxis] = ()
 
 
-def new_stand(name: str, connected: Connected | None) -> dict[str, str]:
+def make_stand_files(name: str, connected: Connected | None) -> dict[str, str]:
     """The files of a stand's folder by name; the simulated stand's without `connected`."""
-    own = {"name": _quoted(name), "target": "target.yaml"}
-    text = _text("", "simulated" if connected is None else "laboratory")
+    own = {"name": _quote(name), "target": "target.yaml"}
+    text = _read_installed("", "simulated" if connected is None else "laboratory")
     for key, value in own.items():
-        text = _set(text, rf"^{key}: *\S+", f"{key}: {_literal(value)}")
+        text = _substitute(text, rf"^{key}: *\S+", f"{key}: {_escape_replacement(value)}")
     if connected is not None:
-        text = _with_devices(text, connected)
+        text = _insert_devices(text, connected)
     recipe = "demo" if connected is None else "thermal-cycle"
     return {
         "stand.yaml": text,
-        "recipe.yaml": _text("recipes", recipe),
-        "target.yaml": _text("targets", "paper-9x6"),
+        "recipe.yaml": _read_installed("recipes", recipe),
+        "target.yaml": _read_installed("targets", "paper-9x6"),
         "README.md": f"# {name}\n\n{_README}",
     }
 
 
-def _with_devices(text: str, connected: Connected) -> str:
+def _insert_devices(text: str, connected: Connected) -> str:
     if connected.bus:
-        text = _set(text, r"(?<=^bus:)(.*\n  address: )\S+", rf"\g<1>{_literal(connected.bus)}")
+        text = _substitute(text, r"(?<=^bus:)(.*\n  address: )\S+", rf"\g<1>{_escape_replacement(connected.bus)}")
     if connected.flap:
-        text = _set(text, r"(?<=^flap:)(.*\n  serial_number: )\S+", rf"\g<1>{_literal(_quoted(connected.flap))}")
+        text = _substitute(
+            text, r"(?<=^flap:)(.*\n  serial_number: )\S+", rf"\g<1>{_escape_replacement(_quote(connected.flap))}"
+        )
     if connected.camera:
-        text = _set(text, r"(?m)(^    address: )\d\S+", rf"\g<1>{_literal(connected.camera)}")
+        text = _substitute(text, r"(?m)(^    address: )\d\S+", rf"\g<1>{_escape_replacement(connected.camera)}")
     if connected.camera_serial:
-        text = _set(text, r"(?m)(^    serial_number: )\S+", rf"\g<1>{_literal(_quoted(connected.camera_serial))}")
+        text = _substitute(
+            text, r"(?m)(^    serial_number: )\S+", rf"\g<1>{_escape_replacement(_quote(connected.camera_serial))}"
+        )
     for axis in connected.axes:
-        wanted = rf'\g<1>{{address: "serial:{_literal(axis.address)}", serial_number: {axis.serial_number},'
-        text = _set(text, rf"(^  {re.escape(axis.name)}: )\{{address: \S+ serial_number: \d+,", wanted)
+        wanted = rf'\g<1>{{address: "serial:{_escape_replacement(axis.address)}", serial_number: {axis.serial_number},'
+        text = _substitute(text, rf"(^  {re.escape(axis.name)}: )\{{address: \S+ serial_number: \d+,", wanted)
     return text
 
 
-def _set(text: str, pattern: str, by: str) -> str:
+def _substitute(text: str, pattern: str, by: str) -> str:
     found, count = re.subn(pattern, by, text, count=1, flags=re.MULTILINE)
     if not count:
         raise ConfigError(f"the installed stand's file has no place for {by}; give its name as it is there")
     return found
 
 
-def _text(folder: Folder, name: str) -> str:
+def _read_installed(folder: Folder, name: str) -> str:
     """Of an installed file; its schema is named beside it, so that the folder may go to any computer."""
-    return _SCHEMA.sub(r"$schema=schema/\1", packaged(folder, name).read_text("utf-8"))
+    return _SCHEMA.sub(r"$schema=schema/\1", find_packaged(folder, name).read_text("utf-8"))
 
 
-def _literal(text: str) -> str:
+def _escape_replacement(text: str) -> str:
     """In what a pattern is replaced by."""
     return text.replace("\\", r"\\")
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     """A number in quotes stays a text."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

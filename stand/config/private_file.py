@@ -12,18 +12,18 @@ from thermostand.foundation.errors import ConfigError
 _LARGEST_BYTES = 100_000  # a token has some dozen
 
 
-def private_document(path: Path, key: str, model: type[Model], form: str) -> Model:
+def load_private_document(path: Path, key: str, model: type[Model], form: str) -> Model:
     """The file that `key` of a stand's file names. ConfigError, which says what `form` it should have, when it cannot
     be used, or others may read or write it; its sentence quotes nothing of the file."""
     place = f"{key}: {path}"
-    text = _text(path, place)
+    text = _read_text(path, place)
     try:
         return parse_document(text, model, str(path))
     except ConfigError:
         raise ConfigError(f"{place}: is not as it should be: {form}") from None  # the reason would quote a secret
 
 
-def _text(path: Path, place: str) -> str:
+def _read_text(path: Path, place: str) -> str:
     try:
         fd = os.open(path.expanduser(), os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:

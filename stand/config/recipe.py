@@ -8,20 +8,28 @@ from typing import Self, cast
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from thermostand.experiments.calibration import CalibrationGrid, calibration
+from thermostand.experiments.calibration import CalibrationGrid, plan_calibration
+from thermostand.experiments.recipe_steps import (
+    Place,
+    PlanError,
+    RecipeStep,
+    StepEntries,
+    check_steps,
+    describe_unknown,
+    expand_entries,
+)
 from thermostand.experiments.steps import PlannedStep, Situation, Step, number_steps
-from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
-from thermostand.experiments.validation import Validation, validation
-from thermostand.experiments.warm_up import WarmUp, warm_up
-from thermostand.experiments.written import Place, PlanError, StepEntries, Written, checked, unknown, written_steps
+from thermostand.experiments.thermal_cycle import ThermalCycle, plan_thermal_cycle
+from thermostand.experiments.validation import Validation, plan_validation
+from thermostand.experiments.warm_up import WarmUp, plan_warm_up
 from thermostand.foundation.documents import Document
-from thermostand.stand.config.added_experiments import added_names, added_steps, adding_package
+from thermostand.stand.config.experiment_plugins import find_package, list_experiments, make_steps
 
 _MADE_BY: Mapping[str, Callable[..., Iterable[Step]]] = {
-    "warm_up": warm_up,
-    "thermal_cycle": thermal_cycle,
-    "calibration": calibration,
-    "validation": validation,
+    "warm_up": plan_warm_up,
+    "thermal_cycle": plan_thermal_cycle,
+    "calibration": plan_calibration,
+    "validation": plan_validation,
 }
 _MOST_VISITS = 10_000  # captures; more than any camera lives through, and a plan is still listed within a second
 
@@ -40,22 +48,24 @@ class Experiment(Document):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _known(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _parse_experiment(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
         entry = cast("dict[object, object]", data) if isinstance(data, dict) else {}
         others = [name for name in entry if name not in cls.model_fields]
         if not others:
             return handler(data)
-        name, known = str(others[0]), [*cls.model_fields, *added_names()]
+        name, known = str(others[0]), [*cls.model_fields, *list_experiments()]
         if name not in known:
-            raise ValueError(f"{unknown('experiment', name, known)}; others come with the package that adds them")
+            raise ValueError(
+                f"{describe_unknown('experiment', name, known)}; others come with the package that adds them"
+            )
         if len(entry) > 1:
             raise ValueError(f"give exactly one of {', '.join(known)}")
         experiment = cls.model_construct()
-        experiment._added = (name, added_steps(name, entry[name]))
+        experiment._added = (name, make_steps(name, entry[name]))
         return experiment
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> Self:
+    def _check_one_key(self) -> Self:
         if len(self._given) + bool(self._added[0]) != 1:
             raise ValueError(f"give exactly one of {', '.join(type(self).model_fields)}")
         return self
@@ -68,18 +78,18 @@ class Experiment(Document):
     @property
     def package(self) -> str:
         """The package that adds the entry's experiment, and its version; "" for our own."""
-        return adding_package(self._added[0]) if self._added[0] else ""
+        return find_package(self._added[0]) if self._added[0] else ""
 
-    def sequence(self, place: Place = (), found: Situation | None = None) -> Generator[Written, None, None]:
+    def make_sequence(self, place: Place = (), found: Situation | None = None) -> Generator[RecipeStep, None, None]:
         """The steps of this entry, which stands at `place`; found: what those before it leave."""
         if self.steps is not None:
-            yield from written_steps(self.steps, (*place, "steps"), found or Situation())
+            yield from expand_entries(self.steps, (*place, "steps"), found or Situation())
             return
         name, steps = self._added
         if not name:
             name, parameters = next(iter(self._given.items()))
             steps = _MADE_BY[name](parameters)
-        yield from (Written((*place, name), step) for step in steps)
+        yield from (RecipeStep((*place, name), step) for step in steps)
 
     @property
     def _given(self) -> dict[str, object]:
@@ -98,7 +108,7 @@ class Recipe(Document):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_one(cls, data: object) -> object:
+    def _check_is_recipe(cls, data: object) -> object:
         keys = cast("dict[object, object]", data) if isinstance(data, dict) else {}
         if "bus" in keys and "experiments" not in keys and "steps" not in keys:
             raise ValueError(
@@ -108,14 +118,14 @@ class Recipe(Document):
         return data
 
     @model_validator(mode="after")
-    def _can_be_done(self) -> Self:
+    def _check_plan(self) -> Self:
         if not self.experiments and not self.steps:
             raise ValueError("nothing to do; give experiments: with one entry or more, or steps:")
         visits = sum(experiment.visits for experiment in self.experiments)
         if visits > _MOST_VISITS:
             raise ValueError(f"{visits} visits of set-points and positions are more than {_MOST_VISITS}")
         try:
-            for _ in checked(self._written()):
+            for _ in check_steps(self._expand()):
                 pass
         except PlanError as error:
             fault = PydanticCustomError("plan", "{text}", {"text": str(error)})
@@ -126,17 +136,17 @@ class Recipe(Document):
 
     def plan(self) -> Iterator[PlannedStep]:
         """Every step in order, numbered and identified."""
-        return number_steps(written.step for written in self._written())
+        return number_steps(written.step for written in self._expand())
 
     @property
     def packages(self) -> tuple[str, ...]:
         """Those of other people that the plan depends on, with their versions."""
         return tuple(sorted({experiment.package for experiment in self.experiments} - {""}))
 
-    def _written(self) -> Iterator[Written]:
+    def _expand(self) -> Iterator[RecipeStep]:
         found = Situation()
         for number, experiment in enumerate(self.experiments):
-            for written in experiment.sequence(("experiments", number), found):
+            for written in experiment.make_sequence(("experiments", number), found):
                 yield written
                 found = written.step.situation_after(found)
-        yield from written_steps(self.steps, ("steps",), found)
+        yield from expand_entries(self.steps, ("steps",), found)

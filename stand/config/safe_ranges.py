@@ -67,16 +67,18 @@ _AIR_SENSOR = SafeRange(
 _CORRECTION = "a temperature that far from what the module indicates is a slip in the file, and hides heat"
 
 
-def outside(config: object, thermometers: Mapping[str, ThermometerSettings]) -> dict[str, float]:
+def find_outside(config: object, thermometers: Mapping[str, ThermometerSettings]) -> dict[str, float]:
     """The values of `config` outside their safe ranges, by their paths."""
-    return {safe.path: value for safe, value in _values(config, thermometers) if value not in safe}
+    return {safe.path: value for safe, value in _list_values(config, thermometers) if value not in safe}
 
 
 def check(config: object, thermometers: Mapping[str, ThermometerSettings], accepted: Sequence[str]) -> None:
     """ValueError with a sentence for each value that is outside its range and not `accepted`, and for each entry of
     `accepted` that is no such path, is given twice, or has a value within its range."""
-    found = list(_values(config, thermometers))
-    faults = [_refusal(safe, value) for safe, value in found if value not in safe and safe.path not in accepted]
+    found = list(_list_values(config, thermometers))
+    faults = [
+        _describe_refusal(safe, value) for safe, value in found if value not in safe and safe.path not in accepted
+    ]
     known = {safe.path: (safe, value) for safe, value in found}
     for path in dict.fromkeys(accepted):
         if path not in known:
@@ -90,16 +92,19 @@ def check(config: object, thermometers: Mapping[str, ThermometerSettings], accep
         raise ValueError("; ".join(faults))
 
 
-def _values(config: object, thermometers: Mapping[str, ThermometerSettings]) -> Iterator[tuple[SafeRange, float]]:
+def _list_values(config: object, thermometers: Mapping[str, ThermometerSettings]) -> Iterator[tuple[SafeRange, float]]:
     for safe in SAFE_RANGES:
         yield safe, float(attrgetter(safe.path)(config))
     yield _AIR_SENSOR, float(len(attrgetter("independent_air_sensors")(config)))
     for name, entry in thermometers.items():
         path = f"thermometers.{name}.polynomial"
-        yield SafeRange(path, " K", _CORRECTION, high=10), largest_correction_K(entry.offset_K, entry.polynomial)
+        yield (
+            SafeRange(path, " K", _CORRECTION, high=10),
+            compute_largest_correction_K(entry.offset_K, entry.polynomial),
+        )
 
 
-def _refusal(safe: SafeRange, value: float) -> str:
+def _describe_refusal(safe: SafeRange, value: float) -> str:
     low_degC, high_degC = PLAUSIBLE_DEGC
     what = f"{value:g}{safe.unit}"
     if safe.reason == _CORRECTION:
@@ -110,7 +115,7 @@ def _refusal(safe: SafeRange, value: float) -> str:
     )
 
 
-def largest_correction_K(offset_K: float, polynomial: Sequence[float]) -> float:
+def compute_largest_correction_K(offset_K: float, polynomial: Sequence[float]) -> float:
     """The largest distance, K, of a corrected temperature from the indicated one over PLAUSIBLE_DEGC; 1e9 when it is
     more, or cannot be computed."""
     low_degC, high_degC = PLAUSIBLE_DEGC
@@ -125,7 +130,7 @@ def largest_correction_K(offset_K: float, polynomial: Sequence[float]) -> float:
     return min(largest_K, _MOST_K) if math.isfinite(largest_K) else _MOST_K
 
 
-def accepted_text(accepted: Mapping[str, float]) -> str:
+def describe_accepted(accepted: Mapping[str, float]) -> str:
     """The sentence, shown at each start, on values outside their safe ranges that `guard.overrides` allows."""
     ranges = {safe.path: str(safe) for safe in (*SAFE_RANGES, _AIR_SENSOR)}
     usual = "a correction of at most 10 K"

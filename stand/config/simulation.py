@@ -14,13 +14,13 @@ from thermostand.foundation.addresses import TcpAddress
 from thermostand.foundation.documents import Document
 
 
-def _printable(path: Path) -> Path:
+def _check_printable(path: Path) -> Path:
     if not str(path).isprintable():
         raise ValueError("expected a path of printable characters")
     return path
 
 
-def _of_this_century(start: datetime) -> datetime:
+def _check_century(start: datetime) -> datetime:
     if not 2000 <= start.year < 2100:
         raise ValueError("expected a time of the years 2000 to 2099")
     return start
@@ -28,7 +28,7 @@ def _of_this_century(start: datetime) -> datetime:
 
 BUILT_IN = ("modified", "unmodified")
 OPTICS = [*BUILT_IN, "nac", "navcam", "dic", "phone"]
-PrintablePath = Annotated[Path, AfterValidator(_printable)]
+PrintablePath = Annotated[Path, AfterValidator(_check_printable)]
 FaultText = Annotated[str, Field(pattern=r"^[A-Za-z_]+\.[A-Za-z_]+(=.+)?(@[\d.]+(s|min|h)?)?(:[\d.]+(s|min|h)?)?$")]
 
 
@@ -44,7 +44,7 @@ class SimulatedCamera(Document):
     genicam: PrintablePath | None = None
 
     @model_validator(mode="after")
-    def _effects_of_a_preset(self) -> Self:
+    def _check_effects(self) -> Self:
         if not self.is_preset and (self.effects or self.drawn is not None):
             raise ValueError(
                 f"effects and drawn need optics of a file of configs/optics, such as nac; these are {self.optics}"
@@ -65,7 +65,7 @@ class SimulationConfig(Document):
     names)."""
 
     control: TcpAddress
-    start: Annotated[AwareDatetime, AfterValidator(_of_this_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
+    start: Annotated[AwareDatetime, AfterValidator(_check_century)] = datetime(2026, 1, 1, 18, tzinfo=UTC)
     seed: int = Field(default=1, ge=0)
     camera: Literal["modified", "unmodified"] = "modified"
     cameras: dict[DeviceName, SimulatedCamera] = Field(default_factory=dict)

@@ -28,7 +28,7 @@ from thermostand.drivers.devices.chambers.chamber_language import ChamberUnitSet
 from thermostand.drivers.devices.chambers.climate_chamber import ClimateChamberSettings
 from thermostand.drivers.devices.imager.thermal_imager import ThermalImagerSettings
 from thermostand.drivers.devices.inputs import InputsSettings
-from thermostand.drivers.devices.kinds import Equipment, added_settings, built_in, equipment_of
+from thermostand.drivers.devices.kinds import Equipment, list_equipment, load_built_in_kinds, load_settings
 from thermostand.drivers.devices.motion.flap import FlapSettings
 from thermostand.drivers.devices.motion.stage import AxisSettings
 from thermostand.drivers.devices.probes import ProbeSettings
@@ -41,9 +41,9 @@ from thermostand.drivers.devices.thermometers import (
     Role,
     ThermometerModuleSettings,
     ThermometerSettings,
-    by_channel,
+    list_by_channel,
 )
-from thermostand.drivers.settings import CameraSettings, DeviceName, Line, OnBus, Polled, ascending
+from thermostand.drivers.settings import CameraSettings, DeviceName, Line, OnBus, Polled, check_ascending
 from thermostand.drivers.wires.bus import BusSettings
 from thermostand.experiments.parameters import Chamber_degC
 from thermostand.foundation.documents import Document, load_document
@@ -53,11 +53,11 @@ from thermostand.stand.config.chamber_section import ChamberConfig
 from thermostand.stand.config.dew import DewConfig, EndingConfig
 from thermostand.stand.config.guard_section import GuardConfig
 from thermostand.stand.config.interface_section import InterfaceConfig
-from thermostand.stand.config.safe_ranges import check, outside
+from thermostand.stand.config.safe_ranges import check, find_outside
 from thermostand.stand.config.simulation import PrintablePath, SimulatedCamera, SimulationConfig
 
 
-def _kind_of(regulator: object) -> str:
+def _get_kind(regulator: object) -> str:
     """A unit on the bus has no kind."""
     if isinstance(regulator, dict):
         return str(cast("dict[str, object]", regulator).get("kind", "on_bus"))
@@ -67,14 +67,14 @@ def _kind_of(regulator: object) -> str:
 RegulatorSettings = Annotated[
     Annotated[OnBus, Tag("on_bus")] | Annotated[SoftwareRegulatorSettings, Tag("software")],
     Discriminator(
-        _kind_of,
+        _get_kind,
         custom_error_type="kind",
         custom_error_message="must have kind: software, or no kind and the registers of a unit on the bus",
     ),
 ]
 AddedDevice = Annotated[
     SerializeAsAny[Polled],
-    BeforeValidator(added_settings),
+    BeforeValidator(load_settings),
     WithJsonSchema({"type": "object", "properties": {"kind": {"type": "string"}}, "required": ["kind"]}),
 ]
 Folder = Literal["", "registers", "recipes", "targets", "optics"]
@@ -84,7 +84,7 @@ LEADING = "camera"  # the camera by whose temperature soaks, cool-downs and mode
 class LimitsConfig(Document):
     """What no step and no operator may exceed."""
 
-    chamber_degC: Annotated[tuple[Chamber_degC, Chamber_degC], AfterValidator(ascending)] = (-10.0, 60.0)
+    chamber_degC: Annotated[tuple[Chamber_degC, Chamber_degC], AfterValidator(check_ascending)] = (-10.0, 60.0)
 
 
 class CompressorConfig(Document):
@@ -161,7 +161,7 @@ class StandConfig(Document):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_one_of_today(cls, data: object) -> object:
+    def _check_current_format(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
         keys = cast("dict[str, object]", data)
@@ -180,34 +180,34 @@ class StandConfig(Document):
 
     @model_validator(mode="after")
     def _cross_checks(self) -> Self:
-        faults = next(self._faults(), None)
+        faults = next(self._find_faults(), None)
         if faults is not None:
             raise ValueError(faults)
         check(self, self.thermometers, self.guard.overrides)
         return self
 
-    def _faults(self) -> Iterator[str]:
+    def _find_faults(self) -> Iterator[str]:
         """What of one section does not fit another."""
-        yield from _unfit_roles(self.thermometers)
-        yield from self._unfit_control()
-        yield from self._unfit_devices()
-        yield from self._unfit_limits()
-        yield from self._unfit_periods()
+        yield from _find_role_faults(self.thermometers)
+        yield from self._find_control_faults()
+        yield from self._find_device_faults()
+        yield from self._find_limit_faults()
+        yield from self._find_period_faults()
 
-    def _unfit_control(self) -> Iterator[str]:
+    def _find_control_faults(self) -> Iterator[str]:
         if (self.regulator is None) == (self.climate_chamber is None):
             yield "a stand has either a regulator or a climate_chamber, which holds the chamber's temperature"
         if self.regulator is not None and self.relays is None:
             yield "relays is missing: a board has to enable the regulator's heat; only a climate_chamber needs none"
         if isinstance(self.regulator, SoftwareRegulatorSettings):
-            yield from self._unfit_software(self.regulator)
-            yield from self._unfit_output(self.regulator)
+            yield from self._find_software_faults(self.regulator)
+            yield from self._find_output_faults(self.regulator)
         elif self.relays is not None and HEAT in self.relays.channels:
             yield f"relays.channels has {HEAT}, which is the output of a regulator of kind: software, and this is none"
         elif self.heat_module is not None:
             yield "heat_module is the output of a regulator of kind: software, and this is none"
 
-    def _unfit_output(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
+    def _find_output_faults(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
         module, guard = self.heat_module, self.guard
         has_relay = self.relays is not None and HEAT in self.relays.channels
         if module is None:
@@ -223,7 +223,7 @@ class StandConfig(Document):
         if module.watchdog_s < 2 * regulator.sample_s:
             yield "heat_module.watchdog_s must be at least twice regulator.sample_s, or it trips between two steps"
 
-    def _unfit_software(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
+    def _find_software_faults(self, regulator: SoftwareRegulatorSettings) -> Iterator[str]:
         if regulator.thermometer not in self.sensors:
             known = ", ".join(self.sensors)
             yield f"regulator.thermometer: there is no thermometer {regulator.thermometer}, by its role {known}"
@@ -242,7 +242,7 @@ class StandConfig(Document):
                 f"more than {compressor.start_above_cool_percent:g} %; take 0 for a chamber that only heats"
             )
 
-    def _unfit_devices(self) -> Iterator[str]:
+    def _find_device_faults(self) -> Iterator[str]:
         regulator = self.regulator_unit
         units = [each.unit for each in (regulator, self.heat_module, self.relays) if each is not None]
         units += self.thermometer_module.units
@@ -252,13 +252,13 @@ class StandConfig(Document):
         if self.inputs is not None and self.inputs.unit in (*others, *self.thermometer_module.units):
             yield "inputs.unit is that of the regulator or the thermometers; take the relay board's, or another"
         equipment = self.equipment
-        there = [place for each in equipment if each.settings is not None for place in each.kind.places(each.settings)]
-        addresses = [self.bus.address, *(place.text for place in there if place.how in ("wire", "host"))]
+        remote = [place for each in equipment if each.settings is not None for place in each.kind.places(each.settings)]
+        addresses = [self.bus.address, *(place.text for place in remote if place.how in ("wire", "host"))]
         if twice := [address for address in addresses if addresses.count(address) > 1]:
             yield f"bus and devices need addresses of their own, {twice[0]} is given twice"
         if unknown := [] if self.simulation is None else sorted(set(self.simulation.cameras) - set(self.cameras)):
             yield f"simulation.cameras has {unknown[0]}, and no camera of the stand is named so"
-        taken = {"bus", "stand", "control", *(kind.device for kind in built_in())}
+        taken = {"bus", "stand", "control", *(kind.device for kind in load_built_in_kinds())}
         names = [*(each.name for each in equipment if not each.kind.device), *taken]
         if twice := [name for name in names if names.count(name) > 1]:
             yield f"the name {twice[0]} is that of two devices; each needs one of its own"
@@ -269,7 +269,7 @@ class StandConfig(Document):
         if self.cameras and self.relays is not None and "camera_power" not in self.relays.channels:
             yield "relays.channels lacks camera_power, the supply of the cameras"
 
-    def _unfit_limits(self) -> Iterator[str]:
+    def _find_limit_faults(self) -> Iterator[str]:
         highest_degC, guard = self.limits.chamber_degC[1], self.guard
         if highest_degC >= guard.max_air_degC:
             yield "guard.max_air_degC must be above the upper limits.chamber_degC, or a normal run trips it"
@@ -291,7 +291,7 @@ class StandConfig(Document):
             if limit_degC < highest_degC:  # they follow the air
                 yield f"guard.max_{name}_degC {limit_degC} is below the upper limits.chamber_degC"
 
-    def _unfit_periods(self) -> Iterator[str]:
+    def _find_period_faults(self) -> Iterator[str]:
         guard, cameras_s = self.guard, [camera.poll_s for camera in self.cameras.values()]
         if self.flap is not None and self.flap.poll_s * 2 > guard.flap_open_s:
             yield f"guard.flap_open_s must be at least twice flap.poll_s ({self.flap.poll_s} s)"
@@ -307,7 +307,7 @@ class StandConfig(Document):
     @property
     def sensors(self) -> dict[str, ThermometerSettings]:
         """The thermometers by what they are read as: their roles, or their own names."""
-        return by_channel(self.thermometers)
+        return list_by_channel(self.thermometers)
 
     @property
     def independent_air_sensors(self) -> list[str]:
@@ -331,9 +331,9 @@ class StandConfig(Document):
     @property
     def equipment(self) -> tuple[Equipment, ...]:
         """Every device, in the order in which they are opened, and what is in the place of those that it lacks."""
-        return equipment_of(self, self.devices)
+        return list_equipment(self, self.devices)
 
-    def sections_with(self, changed: Mapping[str, Any]) -> dict[str, Any]:
+    def replace_settings(self, changed: Mapping[str, Any]) -> dict[str, Any]:
         """The sections, by their keys, with the settings of these devices, by name, in the place of their own."""
         update: dict[str, Any] = {}
         for name, kind, _ in self.equipment:
@@ -348,9 +348,9 @@ class StandConfig(Document):
         """The units on the bus, which have a register map, by their sections."""
         return {each.kind.section: each.settings for each in self.equipment if isinstance(each.settings, OnBus)}
 
-    def accepted(self) -> dict[str, float]:
+    def list_accepted(self) -> dict[str, float]:
         """The values outside their safe ranges, which guard.overrides names, by their paths."""
-        return outside(self, self.thermometers)
+        return find_outside(self, self.thermometers)
 
     @property
     def regulator_unit(self) -> OnBus | None:
@@ -378,13 +378,13 @@ GUARDED: tuple[Role, ...] = ("air",)  # without which nothing is heated
 def _independent_air_sensors(thermometers: Mapping[str, ThermometerSettings], controlling: str = "") -> list[str]:
     """The thermometers by which the guard finds that the regulator's probe and the air's are wrong alike: the granite
     inside, which follows the air, and safety ones; not the one that `controlling` names."""
-    sensors = by_channel(thermometers)
+    sensors = list_by_channel(thermometers)
     return [
         name for name, each in sensors.items() if (name == "granite_inside" or each.is_safety) and name != controlling
     ]
 
 
-def _unfit_roles(thermometers: Mapping[str, ThermometerSettings]) -> Iterator[str]:
+def _find_role_faults(thermometers: Mapping[str, ThermometerSettings]) -> Iterator[str]:
     """A sentence for each role that nobody has, that two have, or that another name belies."""
     places = [each.role or name for name, each in thermometers.items()]
     for place in PLACES:
@@ -393,7 +393,7 @@ def _unfit_roles(thermometers: Mapping[str, ThermometerSettings]) -> Iterator[st
     for name, each in thermometers.items():
         if name in PLACES and each.role not in (None, name):
             yield f"thermometers.{name} has the role {each.role}; give it another name, or the role {name}"
-    if missing := [place for place in GUARDED if place not in by_channel(thermometers)]:
+    if missing := [place for place in GUARDED if place not in list_by_channel(thermometers)]:
         yield (
             f"thermometers lacks {', '.join(missing)}, without which nothing is heated; name one so, or give one "
             f"`role: {missing[0]}`"
@@ -405,29 +405,32 @@ def load_config(path: Path) -> StandConfig:
     their whole path."""
     config = load_document(path, StandConfig)
     simulation = config.simulation and config.simulation.model_copy(
-        update={"cameras": {name: _dressed(path, each) for name, each in config.simulation.cameras.items()}}
+        update={
+            "cameras": {name: _resolve_camera_files(path, each) for name, each in config.simulation.cameras.items()}
+        }
     )
     units = config.units
     return config.model_copy(
         update={
-            name: unit.model_copy(update={"registers": _beside(path, unit.registers)}) for name, unit in units.items()
+            name: unit.model_copy(update={"registers": _resolve_path(path, unit.registers)})
+            for name, unit in units.items()
         }
         | {"simulation": simulation}
     )
 
 
-def _dressed(path: Path, camera: SimulatedCamera) -> SimulatedCamera:
+def _resolve_camera_files(path: Path, camera: SimulatedCamera) -> SimulatedCamera:
     """Its GenICam file, and the optics' where they have one, from where the stand's file at `path` is. ConfigError
     where there are no such optics."""
     file = None if camera.genicam is None else (path.parent / camera.genicam).absolute()
     optics = camera.optics
     if camera.is_preset:
-        optics = _beside(path, str(optics))
-        load_document(packaged("optics", optics, key=f"{path}: simulation.cameras.optics"), CameraPreset)
+        optics = _resolve_path(path, str(optics))
+        load_document(find_packaged("optics", optics, key=f"{path}: simulation.cameras.optics"), CameraPreset)
     return camera.model_copy(update={"genicam": file, "optics": optics})
 
 
-def _beside(path: Path, name: str) -> str:
+def _resolve_path(path: Path, name: str) -> str:
     """The whole path of the file of this name beside the configuration at `path`; the name where there is none."""
     file = path.parent / name
     try:
@@ -437,7 +440,7 @@ def _beside(path: Path, name: str) -> str:
     return str(file.absolute()) if is_another else name
 
 
-def packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "") -> Path:
+def find_packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "") -> Path:
     """The file `name` of the installed configs/`folder`, or `name` itself when that is a path that exists; first of all
     beside the file that names it, under `key`.
 

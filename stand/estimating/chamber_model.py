@@ -50,7 +50,7 @@ class Response(Document):
         gap_K = abs(gap_K)
         if gap_K <= level_K:
             return 0.0
-        return self.dead_s + float(_approach_s(gap_K, level_K, self.rate_K_per_s, self.time_constant_s))
+        return self.dead_s + float(_compute_approach_s(gap_K, level_K, self.rate_K_per_s, self.time_constant_s))
 
 
 class ChamberModel(Document):
@@ -92,7 +92,7 @@ class Ramp:
     camera_time_constant_s: float
 
 
-def fit(ramps: Sequence[Ramp]) -> ChamberModel:
+def fit_chamber_model(ramps: Sequence[Ramp]) -> ChamberModel:
     """The model that recorded ramps show: for each direction the response with the least mean absolute error of the
     arrivals, the median of the camera's time constants. What they do not show is as the defaults have it."""
     heating = [ramp for ramp in ramps if ramp.to_degC > ramp.from_degC]
@@ -109,29 +109,29 @@ def fit(ramps: Sequence[Ramp]) -> ChamberModel:
     )
 
 
-def ramps_of(session: Session) -> list[Ramp]:
+def extract_ramps(session: Session) -> list[Ramp]:
     """The ramps of a session that arrived, each followed until the flap opened or the set-point changed again."""
     try:
-        pv = _good(session.readings("regulator.pv"))
+        pv = _drop_bad(session.readings("regulator.pv"))
     except SessionError:  # a run that ended before its first poll
         return []
     try:
-        camera = _good(session.readings("camera.temperature"))
+        camera = _drop_bad(session.readings("camera.temperature"))
     except SessionError:  # a camera without a thermometer
         camera = np.empty((2, 0))
     marks = session.steps()
     found: list[Ramp] = []
     for number, mark in enumerate(marks):
         if mark.kind in _SETS and mark.state is StepState.DONE:
-            end_s = _disturbed_s(marks[number + 1 :], float(pv[0, -1]) if pv.size else 0.0)
+            end_s = _find_disturbance_s(marks[number + 1 :], float(pv[0, -1]) if pv.size else 0.0)
             setpoint_degC = float(str(mark.parameters.get("chamber_degC", "nan")))
-            ramp = _ramp(_between(pv, mark, end_s), _between(camera, mark, end_s), setpoint_degC)
+            ramp = _extract_ramp(_slice(pv, mark, end_s), _slice(camera, mark, end_s), setpoint_degC)
             if ramp is not None:
                 found.append(ramp)
     return found
 
 
-def _approach_s(
+def _compute_approach_s(
     gap_K: NDArray[np.float64] | float,
     level_K: NDArray[np.float64] | float,
     rate_K_per_s: NDArray[np.float64] | float,
@@ -156,7 +156,7 @@ def _fit_response(ramps: Sequence[Ramp], default: Response) -> Response:
             axis.reshape(-1, 1)
             for axis in np.meshgrid(best.rate_K_per_s * factors, best.time_constant_s * factors, indexing="ij")
         )
-        left_s = at_s - _approach_s(gap_K, level_K, rate, time_constant)
+        left_s = at_s - _compute_approach_s(gap_K, level_K, rate, time_constant)
         dead_s = np.maximum(np.median(left_s, axis=1, keepdims=True), 0.0)
         # Ramps that never ran at full rate do not determine the rate: then the default stays.
         strange = np.abs(np.log(rate / default.rate_K_per_s)) + np.abs(np.log(time_constant / default.time_constant_s))
@@ -169,7 +169,7 @@ def _fit_response(ramps: Sequence[Ramp], default: Response) -> Response:
     return best
 
 
-def _ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC: float) -> Ramp | None:
+def _extract_ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC: float) -> Ramp | None:
     """What the air (rows: s since the step, degC) shows; None when the step was small or it did not arrive."""
     if pv.shape[1] < 2:
         return None
@@ -178,26 +178,26 @@ def _ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC: float) 
     if not gap_K >= _LEAST_RAMP_K:
         return None
     levels_K = [level_K for level_K in _ARRIVAL_LEVELS_K if level_K <= gap_K - 0.2]
-    stays_s = {level_K: _stays_within_s(pv, to_degC, level_K) for level_K in levels_K}
+    stays_s = {level_K: _find_arrival_s(pv, to_degC, level_K) for level_K in levels_K}
     if math.isnan(stays_s[BAND_K]):
         return None
-    time_constant_s = _time_constant_s(camera, stays_s[BAND_K], float(pv[0, -1]))
+    time_constant_s = _estimate_time_constant_s(camera, stays_s[BAND_K], float(pv[0, -1]))
     return Ramp(from_degC, to_degC, tuple(stays_s.items()), time_constant_s)
 
 
-def _stays_within_s(pv: NDArray[np.float64], to_degC: float, level_K: float) -> float:
+def _find_arrival_s(pv: NDArray[np.float64], to_degC: float, level_K: float) -> float:
     """From when on every value is within `level_K`, NaN when the last one is not: between two polls, and between the
     display's change to that digit and its next."""
-    times_s = [_last_outside_s(pv, to_degC, level_K + side_K) for side_K in (_HALF_DIGIT_K, -_HALF_DIGIT_K)]
+    times_s = [_find_last_outside_s(pv, to_degC, level_K + side_K) for side_K in (_HALF_DIGIT_K, -_HALF_DIGIT_K)]
     return sum(times_s) / 2.0
 
 
-def _last_outside_s(pv: NDArray[np.float64], to_degC: float, level_K: float) -> float:
+def _find_last_outside_s(pv: NDArray[np.float64], to_degC: float, level_K: float) -> float:
     last = int(np.flatnonzero(np.abs(pv[1] - to_degC) > level_K)[-1])  # the first value is, or there would be no ramp
     return float(pv[0, last : last + 2].mean()) if last + 1 < pv.shape[1] else math.nan
 
 
-def _time_constant_s(camera: NDArray[np.float64], begin_s: float, end_s: float) -> float:
+def _estimate_time_constant_s(camera: NDArray[np.float64], begin_s: float, end_s: float) -> float:
     """From three values at equal distances, which needs no final value: exp(-d/tau) = (c - b) / (b - a)."""
     half_s = (end_s - begin_s - _CAMERA_MEAN_S) / 2.0
     if half_s < _CAMERA_MEAN_S:
@@ -211,20 +211,20 @@ def _time_constant_s(camera: NDArray[np.float64], begin_s: float, end_s: float) 
     return half_s / math.log(1.0 / ratio) if 0.0 < ratio < 1.0 else math.nan
 
 
-def _good(column: tuple[NDArray[np.int64], NDArray[np.float64]]) -> NDArray[np.float64]:
+def _drop_bad(column: tuple[NDArray[np.int64], NDArray[np.float64]]) -> NDArray[np.float64]:
     """(s since the epoch, value) without BAD readings, shape (2, n)."""
     times_ns, values = column
     good = np.isfinite(values)
     return np.stack((times_ns[good] / NS_PER_S, values[good]))
 
 
-def _between(column: NDArray[np.float64], mark: StepMark, end_s: float) -> NDArray[np.float64]:
+def _slice(column: NDArray[np.float64], mark: StepMark, end_s: float) -> NDArray[np.float64]:
     """From the mark to `end_s`, times counted from the mark."""
     begin_s = mark.time_ns / NS_PER_S
     first, last = np.searchsorted(column[0], (begin_s, end_s))
     return column[:, first:last] - np.array([[begin_s], [0.0]])
 
 
-def _disturbed_s(later: Sequence[StepMark], end_s: float) -> float:
+def _find_disturbance_s(later: Sequence[StepMark], end_s: float) -> float:
     times_ns = (mark.time_ns for mark in later if mark.kind in _DISTURBS and mark.state is StepState.STARTED)
     return next((time_ns / NS_PER_S for time_ns in times_ns), end_s)

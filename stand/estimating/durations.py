@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-from thermostand.drivers.devices.cameras.shared_line import overloaded
+from thermostand.drivers.devices.cameras.shared_line import explain_overload
 from thermostand.drivers.devices.motion.stage import AxisSettings
 from thermostand.drivers.devices.motion.stage_profiles import StageProfile
 from thermostand.experiments.steps import KnownStand, Price, Situation, Step
@@ -20,7 +20,7 @@ from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.chamber_model import ChamberModel
 
 
-def move_s(stage: StageProfile, steps: float) -> float:
+def compute_move_s(stage: StageProfile, steps: float) -> float:
     """From rest to rest over so many full steps, s: a trapezoid of speed, a triangle when it is short. A controller
     that is set otherwise shows in the overhead."""
     way = abs(steps)
@@ -57,7 +57,7 @@ class ConfiguredStand(KnownStand):
         profile = self._axis(axis).stage
         below = end - profile.overshoot
         ways = (begin - below, profile.overshoot) if begin > below else (end - begin,)
-        return sum(move_s(profile, way / profile.unit_per_step) for way in ways)
+        return sum(compute_move_s(profile, way / profile.unit_per_step) for way in ways)
 
     def to_home_s(self, axis: str, position: float) -> float:
         """At the speed of homing."""
@@ -101,7 +101,7 @@ class ConfiguredStand(KnownStand):
             return f"this stand has no camera {unknown[0]}; it has {', '.join(known) or 'none'}"
         if interval_s is None:
             return ""
-        if reason := overloaded(self._config.cameras, interval_s):
+        if reason := explain_overload(self._config.cameras, interval_s):
             return reason
         for name, camera in known.items():
             if interval_s < 1 / camera.frame_rate_hz - 1e-9:
@@ -132,7 +132,7 @@ class ConfiguredStand(KnownStand):
         return axis
 
 
-def expect(
+def price_step(
     step: Step, found: Situation, stand: KnownStand, overheads_s: Mapping[str, float] = MappingProxyType({})
 ) -> Price:
     """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work."""

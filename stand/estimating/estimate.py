@@ -24,8 +24,8 @@ from thermostand.experiments.steps import (
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.chamber_model import ChamberModel
-from thermostand.stand.estimating.durations import ConfiguredStand, expect
-from thermostand.stand.estimating.learned import Learned
+from thermostand.stand.estimating.durations import ConfiguredStand, price_step
+from thermostand.stand.estimating.learned_durations import LearnedDurations
 
 # Measured on recorded sessions: bytes per pixel of a frame of the target with shot noise, and of one telemetry message
 # with its share of the index, committed every second.
@@ -89,25 +89,27 @@ class _Approach:
         return replace(self, age_s=self.age_s + lasts_s, captured=self.captured or isinstance(step, Capture))
 
 
-def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | None = None) -> tuple[PricedStep, ...]:
+def price_plan(
+    plan: Iterable[PlannedStep], config: StandConfig, learned: LearnedDurations | None = None
+) -> tuple[PricedStep, ...]:
     """Every step priced; ConfigError naming the first step that goes outside the stand's limits, or saying that
     the whole would take more than a year."""
-    learned = learned or Learned()
+    learned = learned or LearnedDurations()
     frame_px = sum(
         (camera.width_px or _SENSOR_PX[0]) * (camera.height_px or _SENSOR_PX[1]) for camera in config.cameras.values()
     )
-    telemetry_bytes_per_s = _messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
+    telemetry_bytes_per_s = _estimate_messages_per_s(config) * _TELEMETRY_BYTES_PER_MESSAGE
     stand, found = ConfiguredStand(config, learned.chamber), Situation()
     approach = _Approach(LABORATORY_degC, LABORATORY_degC)
     priced: list[PricedStep] = []
     for planned in plan:
         check_step(planned, stand)
         step = planned.step
-        expected = expect(step, found, stand, learned.overheads_s)
+        expected = price_step(step, found, stand, learned.overheads_s)
         duration_s = expected.duration_s
-        in_band_after_s = _in_band_after_s(step, approach, learned.chamber)
-        frames = _frames(step, duration_s, in_band_after_s)
-        size_bytes = frame_px * _image_bytes_per_px(step, frames, config) + duration_s * telemetry_bytes_per_s
+        in_band_after_s = _estimate_in_band_s(step, approach, learned.chamber)
+        frames = _count_frames(step, duration_s, in_band_after_s)
+        size_bytes = frame_px * _estimate_bytes_per_px(step, frames, config) + duration_s * telemetry_bytes_per_s
         priced.append(
             PricedStep(
                 planned=planned,
@@ -117,9 +119,9 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
                 work=expected.work,
                 stated_s=expected.stated_s,
                 in_band_after_s=in_band_after_s,
-                warning=_warning(step, approach, learned.chamber, expected.stated_s)
-                or _in_the_dark(step, found)
-                or _unknown(expected.work, learned),
+                warning=_find_warning(step, approach, learned.chamber, expected.stated_s)
+                or _explain_dark_capture(step, found)
+                or _explain_unknown(expected.work, learned),
             )
         )
         found, approach = step.situation_after(found), approach.after(step, duration_s)
@@ -129,7 +131,7 @@ def price(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned | N
     return tuple(priced)
 
 
-def way_back_s(plan: Iterable[PlannedStep], config: StandConfig, learned: Learned) -> float:
+def estimate_return_s(plan: Iterable[PlannedStep], config: StandConfig, learned: LearnedDurations) -> float:
     """How long the chamber, and a camera that is cold, take back to the laboratory's temperature when the plan is done,
     s; 0 on a stand that does not bring it back, or of a plan that ends there."""
     ending, last_degC = config.ending, config.ending.ambient_degC
@@ -147,76 +149,75 @@ def way_back_s(plan: Iterable[PlannedStep], config: StandConfig, learned: Learne
     return min(ending.max_s, max(way_s, chamber.heating.arrival_s(gap_K, ending.band_K)) + follows_s)
 
 
-def _in_band_after_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
+def _estimate_in_band_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
     """Of a soak: s until the chamber is in its band; None when it is, and of other steps."""
     after_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
     return after_s if isinstance(step, AnySoak) and after_s > 0.0 else None
 
 
-def _frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int:
+def _count_frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int:
     """Of a soak: its looks, from when the chamber is in its band."""
     if not isinstance(step, SoakUntilSettled):
         return step.frame_count
     return max(0, math.ceil((duration_s - (in_band_after_s or 0.0)) / step.look_every_s))
 
 
-def _in_the_dark(step: Step, found: Situation) -> str:
+def _explain_dark_capture(step: Step, found: Situation) -> str:
     """Of a capture of the target through a flap that no step has opened."""
     if not isinstance(step, Capture) or found.flap_open:
         return ""
     return "the flap is closed, so these frames are dark; put open_flap before them, and close_flap after"
 
 
-def _warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
+def _find_warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
     """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then. Of a
     cool-down: that it is too short for a camera that was on. Of a soak that is expected to take expected_s: that it
     will not end in its time."""
     if isinstance(step, CoolDown):
-        too_short = (
-            f"ends after {_minutes(step.max_s)}; the camera needs {_minutes(step.needed_s)} to be within its band"
-        )
+        ends, needs = _format_minutes(step.max_s), _format_minutes(step.needed_s)
+        too_short = f"ends after {ends}; the camera needs {needs} to be within its band"
         return f"the cool-down {too_short}" if step.max_s < step.needed_s else ""
     if isinstance(step, Soak):
-        return _longer(step, approach, chamber, expected_s)
+        return _explain_extension(step, approach, chamber, expected_s)
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC)
     settled_s = chamber.settled_s(approach.from_degC, approach.to_degC)
     if not isinstance(step, Capture) or approach.captured or approach.age_s >= settled_s:
         return ""
     spare_s = approach.age_s - arrives_s
     return (
-        f"the dwell at {approach.to_degC:g} degC ends {_minutes(abs(spare_s))} "
+        f"the dwell at {approach.to_degC:g} degC ends {_format_minutes(abs(spare_s))} "
         f"{'before' if spare_s < 0.0 else 'after'} the chamber arrives; "
-        f"the camera needs {_minutes(settled_s - arrives_s)} to follow"
+        f"the camera needs {_format_minutes(settled_s - arrives_s)} to follow"
     )
 
 
-def _longer(soak: Soak, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
+def _explain_extension(soak: Soak, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
     """Until when a soak goes on beyond its time, or that it ends with the chamber outside its band; "" otherwise."""
     if expected_s <= soak.duration_s:
         return ""
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC, soak.band_K) - approach.age_s
-    arrival = f"the chamber is within {soak.band_K:g} K of {approach.to_degC:g} degC after {_minutes(arrives_s)}"
+    arrival = f"the chamber is within {soak.band_K:g} K of {approach.to_degC:g} degC after {_format_minutes(arrives_s)}"
     if arrives_s + soak.last_part_s <= soak.longest_s:
-        return f"{arrival}: the soak is expected to go on until {_minutes(expected_s)}"
+        return f"{arrival}: the soak is expected to go on until {_format_minutes(expected_s)}"
     end = "the run is held then" if soak.unsettled == "hold" else "the frames after it are marked as unsettled"
-    return f"{arrival}: too late for a soak of at most {_minutes(expected_s)}; {end}"
+    return f"{arrival}: too late for a soak of at most {_format_minutes(expected_s)}; {end}"
 
 
-def _unknown(work: str, learned: Learned) -> str:
+def _explain_unknown(work: str, learned: LearnedDurations) -> str:
     if work != COOL_DOWN_AS_FOUND or work in learned.overheads_s:
         return ""
     return "as of a camera that was on; one that is cold already takes no time"
 
 
-def _minutes(duration_s: float) -> str:
+def _format_minutes(duration_s: float) -> str:
     return f"{duration_s / 60:.0f} min"
 
 
-def _messages_per_s(config: StandConfig) -> float:
+def _estimate_messages_per_s(config: StandConfig) -> float:
     return sum(1.0 / each.poll_s for each in config.equipment if each.settings is not None and each.poll_s is not None)
 
 
-def _image_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
+def _estimate_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
     """What all frames of a step take, per pixel of one; with `roi` a step's first frame is whole, then one at times."""
     recording, whole = config.recording, 0
     if isinstance(step, Capture | SoakUntilSettled) and recording.frame_encoding == "roi" and frames:

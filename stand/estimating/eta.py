@@ -10,7 +10,7 @@ from statistics import median_low
 from types import MappingProxyType
 from typing import Any, cast
 
-from thermostand.experiments.steps import KnownStand, Situation, number_steps, step_of
+from thermostand.experiments.steps import KnownStand, Situation, make_step, number_steps
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, PLAN_CHANGED, SOAK_LONGER, TO_AMBIENT
 from thermostand.foundation.items import Event, StepMark, StepState
@@ -44,7 +44,7 @@ class Eta:
         after_s: float = 0.0,
     ) -> None:
         self._expected_s = {step.planned.step_id: step.duration_s for step in steps}  # with what it has earned
-        self._steps = [_owed(step, soaked_s.get(step.planned.step_id, 0.0)) for step in steps]
+        self._steps = [_subtract_soaked(step, soaked_s.get(step.planned.step_id, 0.0)) for step in steps]
         self._waiting = {step.planned.index: step for step in self._steps if step.planned.step_id not in done}
         self._first = min(self._waiting, default=0)
         self._stated_s = sum(step.stated_s for step in self._waiting.values())
@@ -152,7 +152,7 @@ class Eta:
         if isinstance(by, list) and isinstance(first, int):
             for index in range(first, len(self._steps)):
                 self._forget(index)
-            steps = (step_of(each["kind"], each["parameters"]) for each in cast("list[dict[str, Any]]", by))
+            steps = (make_step(each["kind"], each["parameters"]) for each in cast("list[dict[str, Any]]", by))
             del self._steps[first:]
             found = Situation()
             for planned in number_steps(steps, first):
@@ -209,6 +209,6 @@ class Eta:
         return (now_ns - self._begun_ns - held_ns) / NS_PER_S
 
 
-def _owed(step: PricedStep, soaked_s: float) -> PricedStep:
+def _subtract_soaked(step: PricedStep, soaked_s: float) -> PricedStep:
     soaked_s = min(soaked_s, step.stated_s)
     return replace(step, stated_s=step.stated_s - soaked_s, duration_s=step.duration_s - soaked_s)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from thermostand.experiments.steps import PlannedStep
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.estimating.estimate import PricedStep, price, way_back_s
-from thermostand.stand.estimating.learned import load_learned
+from thermostand.stand.estimating.estimate import PricedStep, estimate_return_s, price_plan
+from thermostand.stand.estimating.learned_durations import load_learned_durations
 
 
 @dataclass(frozen=True, slots=True)
-class Night:
+class PlanEstimate:
     """steps: of the plan, each priced. after_s: what follows the last one, the way back to the laboratory's
     temperature."""
 
@@ -27,20 +27,20 @@ class Night:
         return sum(step.duration_s for step in self.steps) + self.after_s
 
 
-def price_night(plan: Sequence[PlannedStep], config: StandConfig, directory: Path) -> Night:
+def estimate_plan(plan: Sequence[PlannedStep], config: StandConfig, directory: Path) -> PlanEstimate:
     """Of a plan whose session will lie in `directory`; ConfigError as price."""
-    learned = load_learned(directory)
-    return Night(price(plan, config, learned), way_back_s(plan, config, learned))
+    learned = load_learned_durations(directory)
+    return PlanEstimate(price_plan(plan, config, learned), estimate_return_s(plan, config, learned))
 
 
-def existing(directory: Path) -> Path:
+def find_existing(directory: Path) -> Path:
     """`directory`, or the nearest folder above it that is there."""
     return next(path for path in (directory, *directory.absolute().parents) if path.exists() or path.is_symlink())
 
 
-def small_disk(directory: Path, steps: Iterable[PricedStep], config: StandConfig) -> str:
+def explain_small_disk(directory: Path, steps: Iterable[PricedStep], config: StandConfig) -> str:
     """What is wrong with the disk's room for a run that would stop in the middle of the night; "" when it will do."""
-    free_bytes = shutil.disk_usage(existing(directory)).free
+    free_bytes = shutil.disk_usage(find_existing(directory)).free
     plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
     if free_bytes / 1e9 >= plan_GB + least_GB:
         return ""

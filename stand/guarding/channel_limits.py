@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import CONNECTED, guard_rule
 from thermostand.stand.config.guard_section import ChannelLimits
 from thermostand.stand.fault import DONE, Fault, Readings, Rule, Watch
@@ -56,7 +56,7 @@ def _silent(channel: str, after_s: float) -> Rule:
         begun_ns = now_ns if begun_ns is None else begun_ns
         good_ns, latest = readings.last_good_ns(channel), readings.latest(channel)
         silent_ns = now_ns - max(begun_ns, good_ns or 0)
-        if silent_ns <= seconds_ns(after_s):
+        if silent_ns <= to_ns(after_s):
             return None
         why = "it has never been read" if latest is None else latest.reason or "it is not read any more"
         return Fault(CHANNEL_SILENT, f"{channel} has no reading for {silent_ns / NS_PER_S:.0f} s: {why}")

@@ -1,7 +1,8 @@
 """Watches the rules, and waits for nothing but the time: no disk, no bus, no client.
 
-Each look judges the latest readings. While all is well it allows the permits to be renewed (stand.chamber.keeper does
-that); when a rule objects it latches the stand and demands that it is made safe (stand.safety does that).
+Each look judges the latest readings. While all is well it allows the permits to be renewed
+(stand.chamber.permit_renewer does that); when a rule objects it latches the stand and demands that it is made safe
+(stand.safety does that).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.errors import DeviceError
 from thermostand.foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, guard_rule
 from thermostand.foundation.hub import Hub
@@ -17,7 +18,7 @@ from thermostand.stand.fault import Fault, Watch
 from thermostand.stand.guarding.interlocks import (
     NOT_RECORDED,
 )
-from thermostand.stand.guarding.met_errors import MetErrors
+from thermostand.stand.guarding.step_errors import StepErrors
 from thermostand.stand.latch import Latch
 from thermostand.stand.safety import Safety
 
@@ -35,8 +36,8 @@ class Guard:
     On a fault `stop(fault)` ends the run, or `hold(fault)` lets it wait; the trip is recorded, and the stand is made
     safe. A hold stays until the latch is cleared, but for one that ends by itself: `release()`, which
     clears it, is then called when no rule objects any more and the stand has confirmed that it is safe, at most three
-    times an hour. Without a `hold` every trip aborts. A guard that fails aborts. One that `keeps_on` looks on after an
-    abort, which stays latched: that of a stand on which further runs follow.
+    times an hour. Without a `hold` every trip aborts. A guard that fails aborts. One that `keeps_running` looks on
+    after an abort, which stays latched: that of a stand on which further runs follow.
 
     met: device errors that steps have met, whose watches are among `watches`.
 
@@ -58,9 +59,9 @@ class Guard:
     hold: Callable[[Fault], None] | None = None
     release: Callable[[], None] | None = None
     cut_camera: Callable[[], None] | None = None
-    met: MetErrors = field(default_factory=lambda: MetErrors({}))
+    step_errors: StepErrors = field(default_factory=lambda: StepErrors({}))
     vital: tuple[str, ...] = ()
-    keeps_on: bool = False
+    keeps_running: bool = False
     _ended: bool = False
     _looked_ns: int | None = None
     _fresh_after_ns: int = 0
@@ -71,18 +72,18 @@ class Guard:
 
     def look(self) -> bool:
         """Whether the run continues; False when the run is being aborted."""
-        self._note_time()
-        faults = self._faults()
+        self._check_own_timing()
+        faults = self._check_rules()
         fault = next((each for each in faults if each.action == "abort" or self.hold is None), None)
         if fault is not None and not self._is_kept:
             self._abort(fault)
-            return self.keeps_on
-        self._follow_hold(faults)
+            return self.keeps_running
+        self._update_hold(faults)
         return True
 
-    def meet(self, error: DeviceError) -> None:
+    def handle_step_error(self, error: DeviceError) -> None:
         """A step has met it: when this returns the stand is held for it, as by its rule, or aborted."""
-        self.met.note(error)
+        self.step_errors.note(error)
         self.look()
 
     def may_permit(self) -> bool:
@@ -90,7 +91,7 @@ class Guard:
         readings."""
         if self._ended or self.held is not None or self._looked_ns is None:
             return False
-        if self.clock.now_ns() - self._looked_ns > LATE_PERIODS * seconds_ns(self.period_s):
+        if self.clock.now_ns() - self._looked_ns > LATE_PERIODS * to_ns(self.period_s):
             return False
         good_ns = [self.hub.last_good_ns(channel) for channel in self.vital]
         return all(time_ns is not None and time_ns >= self._fresh_after_ns for time_ns in good_ns)
@@ -103,20 +104,20 @@ class Guard:
     @property
     def is_on_time(self) -> bool:
         """Whether it looks as often as it must."""
-        now_ns, late_ns = self.clock.now_ns(), LATE_PERIODS * seconds_ns(self.period_s)
+        now_ns, late_ns = self.clock.now_ns(), LATE_PERIODS * to_ns(self.period_s)
         return not self._ended and self._looked_ns is not None and now_ns - self._looked_ns <= late_ns
 
-    def begin_again(self) -> None:
+    def reset_grace_times(self) -> None:
         """The latch was reset: every grace time begins again, and what was met is forgotten."""
-        self.met.cleared()
+        self.step_errors.clear_answered()
         for watch in self.watches:
             watch.since_ns = None
 
-    def hold_again(self) -> None:
+    def recheck_holds(self) -> None:
         """What is wrong still holds again, what has no grace time before anything moves."""
-        self._follow_hold(self._faults())
+        self._update_hold(self._check_rules())
 
-    def still_wrong(self) -> str:
+    def describe_remaining_faults(self) -> str:
         """For who has just reset: what holds the stand again, or will once it has lasted for its grace time; "" when
         no rule objects to anything."""
         if self.held is not None:
@@ -142,22 +143,22 @@ class Guard:
         try:
             due_ns = self.clock.now_ns()
             while self.look():
-                due_ns = max(due_ns + seconds_ns(self.period_s), self.clock.now_ns())
+                due_ns = max(due_ns + to_ns(self.period_s), self.clock.now_ns())
                 await self.clock.sleep_until(due_ns)
         except Exception as error:
-            self.keeps_on = False
+            self.keeps_running = False
             self._abort(Fault(_GUARD_FAILED, f"the guard failed ({type(error).__name__}: {error})"))
             raise
 
     @property
     def _is_kept(self) -> bool:
         """Whether the stand is already held for a fault that aborts."""
-        return self.keeps_on and self.held is not None and self.held.action == "abort"
+        return self.keeps_running and self.held is not None and self.held.action == "abort"
 
     def _abort(self, fault: Fault) -> None:
         if self.held is None or self.held.action != "abort":
             self.latch.trip(fault)
-        self._ended = not self.keeps_on
+        self._ended = not self.keeps_running
         try:
             # The run's stop latches and leaves the demand for safety to the line below: a run that cannot be ended must
             # not keep the guard from its own.
@@ -165,7 +166,7 @@ class Guard:
         finally:
             self._make_safe(fault)
 
-    def _follow_hold(self, faults: list[Fault]) -> None:
+    def _update_hold(self, faults: list[Fault]) -> None:
         """Begin a hold, replace one that would end by itself by one that does not, or end it."""
         lasting = next((fault for fault in faults if not fault.ends_itself), None)
         if self.held is None and faults:
@@ -185,7 +186,7 @@ class Guard:
 
     def _end_hold(self, fault: Fault) -> None:
         now_ns = self.clock.now_ns()
-        self._endings_ns = [time_ns for time_ns in self._endings_ns if now_ns - time_ns < seconds_ns(3600)]
+        self._endings_ns = [time_ns for time_ns in self._endings_ns if now_ns - time_ns < to_ns(3600)]
         data: dict[str, object] = {"rule": fault.rule, "endings_in_last_h": len(self._endings_ns)}
         if self.release is None or len(self._endings_ns) >= _ENDINGS_PER_H:
             text = (
@@ -199,24 +200,24 @@ class Guard:
         self.hub.publish(HOLD_ENDED.at(now_ns, fault.text, **data))
         self.release()
 
-    def _note_time(self) -> None:
+    def _check_own_timing(self) -> None:
         """Lateness counts from the last look: any cause of a delay counts, also a stopped process."""
         now_ns = self.clock.now_ns()
         looked_ns, self._looked_ns = self._looked_ns, now_ns
-        if looked_ns is None or now_ns - looked_ns <= LATE_PERIODS * seconds_ns(self.period_s):
+        if looked_ns is None or now_ns - looked_ns <= LATE_PERIODS * to_ns(self.period_s):
             return
-        self._late_ns, self._fresh_after_ns = now_ns, now_ns + seconds_ns(_STRADDLING_S)
+        self._late_ns, self._fresh_after_ns = now_ns, now_ns + to_ns(_STRADDLING_S)
         gap_s = (now_ns - looked_ns) / NS_PER_S
         self.hub.publish(GUARD_LATE.at(now_ns, gap_s=gap_s, from_ns=looked_ns, to_ns=now_ns))
 
-    def _faults(self) -> list[Fault]:
+    def _check_rules(self) -> list[Fault]:
         """Those that trip; those that only warn are published when they begin. Every rule is asked: some remember."""
         now_ns = self.clock.now_ns()
         faults: list[Fault] = []
         self._is_excusing = False
         for index, watch in enumerate(self.watches):
             fault = watch.check(self.hub, now_ns)
-            if fault and self._late_ns is not None and now_ns - self._late_ns < seconds_ns(watch.after_gap_s):
+            if fault and self._late_ns is not None and now_ns - self._late_ns < to_ns(watch.after_gap_s):
                 fault, self._is_excusing = None, True
             if watch.action != "warn":
                 if fault is not None:
@@ -225,7 +226,7 @@ class Guard:
                 self._warned.discard(index)
             elif index not in self._warned:
                 self._warned.add(index)
-                self.hub.publish(fault.at(now_ns))
+                self.hub.publish(fault.make_event(now_ns))
         return faults
 
     def _make_safe(self, fault: Fault) -> None:
@@ -233,4 +234,4 @@ class Guard:
         self.safety.demand()
         if fault.cuts_camera and self.cut_camera is not None:
             self.cut_camera()
-        self.hub.publish(fault.at(self.clock.now_ns()))
+        self.hub.publish(fault.make_event(self.clock.now_ns()))

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from typing import Protocol
 
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import CONNECTED, SENSOR, guard_rule
 from thermostand.foundation.readings import Quality
-from thermostand.stand.fault import Fault, Readings, Rule, value_of
+from thermostand.stand.fault import Fault, Readings, Rule, get_value
 
 OVER_TEMPERATURE = guard_rule("over_temperature", "a temperature is above its limit")
 SENSOR_MISSING = guard_rule("sensor_missing", "a temperature that heat depends on was never read", CONNECTED)
@@ -46,13 +46,13 @@ _CAMERA_KNOWN_S = 60.0  # one that was cut off is not read any more: an operator
 _OPEN_ABOVE = 0.05  # of the flap's travel; closed, it reads 0 within the drive's tolerance
 
 
-def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False) -> Rule:
+def limit_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False) -> Rule:
     """`channel` reads above `max_degC`; a BAD or missing value is another rule's business. cuts_camera: it is the
     camera itself that is too warm, and what it read last counts no more when it has been off for a while."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        value_degC, reading = value_of(readings, channel), readings.known(channel)
-        if cuts_camera and reading is not None and now_ns - reading.time_ns > seconds_ns(_CAMERA_KNOWN_S):
+        value_degC, reading = get_value(readings, channel), readings.known(channel)
+        if cuts_camera and reading is not None and now_ns - reading.time_ns > to_ns(_CAMERA_KNOWN_S):
             return None
         if value_degC > max_degC:
             text = f"{channel} is {value_degC:.2f} degC, above the limit of {max_degC} degC"
@@ -62,7 +62,7 @@ def over_temperature(channel: str, max_degC: float, *, cuts_camera: bool = False
     return rule
 
 
-def trustworthy(channel: str, stale_after_s: float) -> Rule:
+def require_fresh_reading(channel: str, stale_after_s: float) -> Rule:
     """`channel` was never read, was last GOOD more than `stale_after_s` ago, or the device itself has said for the
     second poll that it has no measurement: sensor break, converter error, out of range.
 
@@ -95,11 +95,11 @@ def trustworthy(channel: str, stale_after_s: float) -> Rule:
     return rule
 
 
-def disagreement(channel: str, other: str, max_K: float) -> Rule:
+def limit_disagreement(channel: str, other: str, max_K: float) -> Rule:
     """Two sensors of the same air differ by more than `max_K`."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        value_degC, other_degC = value_of(readings, channel), value_of(readings, other)
+        value_degC, other_degC = get_value(readings, channel), get_value(readings, other)
         if abs(value_degC - other_degC) > max_K:
             text = f"{channel} {value_degC:.2f} degC and {other} {other_degC:.2f} degC differ by more than {max_K} K"
             return Fault(SENSORS_DISAGREE, text)
@@ -108,7 +108,7 @@ def disagreement(channel: str, other: str, max_K: float) -> Rule:
     return rule
 
 
-def reported_fault(channel: str) -> Rule:
+def forbid_device_fault(channel: str) -> Rule:
     """A device says that something is wrong: a flag, whose reading's reason says what.
 
     The regulator's names a set-point changed by hand, and manual mode; its driver compares the set-point with the one
@@ -124,29 +124,29 @@ def reported_fault(channel: str) -> Rule:
     return rule
 
 
-def stopped_while_permitted(running: str, permit: str) -> Rule:
+def require_regulator_running(running: str, permit: str) -> Rule:
     """The stand permits heat, yet the regulator does not control: its keys were pressed."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        if value_of(readings, running) == 0 and value_of(readings, permit) == 1:
+        if get_value(readings, running) == 0 and get_value(readings, permit) == 1:
             return Fault(REGULATOR_STOPPED, f"{running} is 0 though heating is permitted: stopped at the unit")
         return None
 
     return rule
 
 
-def permit_missing(running: str, permit: str) -> Rule:
+def require_permit_relay(running: str, permit: str) -> Rule:
     """The regulator controls, yet the relay that lets heat through stays open: a lost write, a stuck relay."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        if value_of(readings, running) == 1 and value_of(readings, permit) == 0:
+        if get_value(readings, running) == 1 and get_value(readings, permit) == 0:
             return Fault(PERMIT_MISSING, f"{permit} is off though the regulator runs")
         return None
 
     return rule
 
 
-def stage_alarm(position: str) -> Rule:
+def forbid_stage_alarm(position: str) -> Rule:
     """An axis' controller has an alarm; not homed or without current, as before the first move, is none."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -158,7 +158,7 @@ def stage_alarm(position: str) -> Rule:
     return rule
 
 
-def settings_changed(channel: str) -> Rule:
+def forbid_changed_settings(channel: str) -> Rule:
     """A stage's controller is set otherwise than its profile says."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -170,15 +170,15 @@ def settings_changed(channel: str) -> Rule:
     return rule
 
 
-def dewed(flap: str, channels: tuple[str, ...], lowest_degC: Callable[[Readings], float]) -> Rule:
+def forbid_dew(flap: str, channels: tuple[str, ...], lowest_degC: Callable[[Readings], float]) -> Rule:
     """The flap is open while one of the channels is below what water of the laboratory's air would settle on."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        if not value_of(readings, flap) > _OPEN_ABOVE:
+        if not get_value(readings, flap) > _OPEN_ABOVE:
             return None
         limit_degC = lowest_degC(readings)
         for channel in channels:
-            value_degC = value_of(readings, channel)
+            value_degC = get_value(readings, channel)
             if value_degC < limit_degC:
                 limit = f"and water may settle below {limit_degC:.1f} degC"
                 return Fault(DEW, f"{channel} is {value_degC:.2f} degC with the flap open, {limit}")
@@ -187,20 +187,20 @@ def dewed(flap: str, channels: tuple[str, ...], lowest_degC: Callable[[Readings]
     return rule
 
 
-def contact(channel: str, fault_when: float, text: str) -> Rule:
+def require_contact_state(channel: str, fault_when: float, text: str) -> Rule:
     """A contact of the stand reads `fault_when` (0 open, 1 closed)."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        return Fault(CONTACT, text) if value_of(readings, channel) == fault_when else None
+        return Fault(CONTACT, text) if get_value(readings, channel) == fault_when else None
 
     return rule
 
 
-def flap_open(position: str, is_excused: Callable[[], bool] = lambda: False) -> Rule:
+def forbid_open_flap(position: str, is_excused: Callable[[], bool] = lambda: False) -> Rule:
     """The flap is open and nothing excuses it; how long that may last is the watch's grace time."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        openness = value_of(readings, position)
+        openness = get_value(readings, position)
         if openness > _OPEN_ABOVE and not is_excused():
             return Fault(FLAP_OPEN, f"{position} is {openness:.2f}, open")
         return None
@@ -208,7 +208,7 @@ def flap_open(position: str, is_excused: Callable[[], bool] = lambda: False) -> 
     return rule
 
 
-def paused(is_paused: Callable[[], bool]) -> Rule:
+def limit_pause(is_paused: Callable[[], bool]) -> Rule:
     """An operator's pause stands; how long it may is the watch's grace time."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -217,7 +217,7 @@ def paused(is_paused: Callable[[], bool]) -> Rule:
     return rule
 
 
-def camera_temperature_bad(channel: str, frames_to_come: Callable[[], bool]) -> Rule:
+def require_camera_temperature(channel: str, frames_to_come: Callable[[], bool]) -> Rule:
     """The camera says that it has no temperature, while it is powered and frames are to come: no model of drift can use
     those. One that does not answer at all is lost, which is another matter."""
 
@@ -230,7 +230,7 @@ def camera_temperature_bad(channel: str, frames_to_come: Callable[[], bool]) -> 
     return rule
 
 
-def frames_stopped(reason: Callable[[], str]) -> Rule:
+def require_frame_recording(reason: Callable[[], str]) -> Rule:
     """The recorder takes no more frames; `reason()` says why, "" while it does."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -239,7 +239,7 @@ def frames_stopped(reason: Callable[[], str]) -> Rule:
     return rule
 
 
-def intrusion(times: Callable[[], int]) -> Rule:
+def forbid_intrusion(times: Callable[[], int]) -> Rule:
     """Heat, cold or the regulator were switched on, twice since the permission was withdrawn, by others. The first
     time is put right with an event; a second one does not end by itself."""
 
@@ -252,7 +252,7 @@ def intrusion(times: Callable[[], int]) -> Rule:
     return rule
 
 
-def heat_uncontrolled(why: Callable[[], str]) -> Rule:
+def forbid_uncontrolled_heat(why: Callable[[], str]) -> Rule:
     """What a regulator of our own heats by does not obey: it reads back other than commanded, and not off. No grace:
     the relay in series is all that ends the heat then."""
 
@@ -281,12 +281,12 @@ class Recording(Protocol):
         ...
 
 
-def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
+def require_durable_recording(recording: Recording, durable_within_s: float) -> Rule:
     """Readings, frames or events are not on the disk in time: heat without a record is of no use."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         since_ns = recording.waiting_since_ns
-        if since_ns is None or now_ns - since_ns <= seconds_ns(durable_within_s):
+        if since_ns is None or now_ns - since_ns <= to_ns(durable_within_s):
             return None
         age_s = (now_ns - since_ns) / NS_PER_S
         text = f"what was measured {age_s:.0f} s ago is not on the disk yet, limit {durable_within_s:g} s"
@@ -295,7 +295,7 @@ def not_recorded(recording: Recording, durable_within_s: float) -> Rule:
     return rule
 
 
-def folder_lost(recording: Recording) -> Rule:
+def require_session_folder(recording: Recording) -> Rule:
     """The session's folder was removed or renamed while it is being recorded."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
@@ -304,7 +304,7 @@ def folder_lost(recording: Recording) -> Rule:
     return rule
 
 
-def recording_ended(recording: Recording) -> Rule:
+def require_recording_process(recording: Recording) -> Rule:
     """Nothing will be recorded any more in this run: the process that writes the session was killed."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:

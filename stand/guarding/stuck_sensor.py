@@ -7,10 +7,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.events import SENSOR, guard_rule
-from thermostand.stand.fault import Fault, Readings, Rule, in_doubt, value_of
-from thermostand.stand.guarding.plausibility import Scatter, remembering
+from thermostand.stand.fault import Fault, Readings, Rule, get_value, is_suspect
+from thermostand.stand.guarding.plausibility import Scatter, make_stateful_rule
 
 SENSOR_STUCK = guard_rule("sensor_stuck", "a temperature stays exactly where it is while it must move", SENSOR)
 FINE_STEP_K = 0.02
@@ -31,7 +31,7 @@ class Still:
     shown: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
-def frozen(channel: str, module: tuple[str, ...], regulator: str) -> Rule:
+def forbid_stuck_sensor(channel: str, module: tuple[str, ...], regulator: str) -> Rule:
     """`channel` has been exactly constant for 5 min while the regulator's output works.
 
     That is evidence for fine converters only; how fine it is shows in the steps of all thermometers of its `module`,
@@ -39,23 +39,23 @@ def frozen(channel: str, module: tuple[str, ...], regulator: str) -> Rule:
     """
 
     def works(readings: Readings) -> bool:
-        outputs = (value_of(readings, f"{regulator}.{side}") for side in ("mv_heat", "mv_cool"))
-        return value_of(readings, f"{regulator}.running") == 1 and any(output > 0 for output in outputs)
+        outputs = (get_value(readings, f"{regulator}.{side}") for side in ("mv_heat", "mv_cool"))
+        return get_value(readings, f"{regulator}.running") == 1 and any(output > 0 for output in outputs)
 
     def step(last: Still | None, readings: Readings, now_ns: int) -> tuple[Still | None, Fault | None]:
-        value = value_of(readings, channel)
-        state = _finer(last or Still(), {name: value_of(readings, name) for name in module})
+        value = get_value(readings, channel)
+        state = _update_step(last or Still(), {name: get_value(readings, name) for name in module})
         if value != state.value or not works(readings):
             return replace(state, value=value, since_ns=now_ns), None
-        if state.step_K > FINE_STEP_K or now_ns - state.since_ns < seconds_ns(_FROZEN_S):
+        if state.step_K > FINE_STEP_K or now_ns - state.since_ns < to_ns(_FROZEN_S):
             return state, None
         text = f"{channel} has been exactly {value:.3f} degC for {_FROZEN_S:g} s while the regulator's output works"
         return state, Fault(SENSOR_STUCK, text)
 
-    return remembering(step)
+    return make_stateful_rule(step)
 
 
-def _finer(state: Still, shown: dict[str, float]) -> Still:
+def _update_step(state: Still, shown: dict[str, float]) -> Still:
     if state.step_K <= FINE_STEP_K:  # fine enough is known
         return state
     steps_K = [abs(value - state.shown.get(name, math.nan)) for name, value in shown.items()]
@@ -72,7 +72,7 @@ class Constant:
     other: float
 
 
-def stuck_while_other_moves(channel: str, other: str) -> Rule:
+def forbid_stuck_while_other_moves(channel: str, other: str) -> Rule:
     """`channel` has been exactly constant for at least a minute, in which `other`, in the same air, went 1 K
     beyond its scatter; one that is in doubt goes nowhere.
 
@@ -82,12 +82,16 @@ def stuck_while_other_moves(channel: str, other: str) -> Rule:
     scatter = Scatter(other)
 
     def step(last: Constant | None, readings: Readings, now_ns: int) -> tuple[Constant | None, Fault | None]:
-        value, other_value, scatter_K = value_of(readings, channel), value_of(readings, other), scatter.most_K(readings)
-        if last is None or value != last.value or in_doubt(readings, other):
+        value, other_value, scatter_K = (
+            get_value(readings, channel),
+            get_value(readings, other),
+            scatter.most_K(readings),
+        )
+        if last is None or value != last.value or is_suspect(readings, other):
             return Constant(value, now_ns, other_value), None
         went_K = abs(other_value - last.other)
-        if now_ns - last.since_ns < seconds_ns(_STUCK_S) or not went_K >= _MOVED_K + scatter_K:
+        if now_ns - last.since_ns < to_ns(_STUCK_S) or not went_K >= _MOVED_K + scatter_K:
             return last, None
         return last, Fault(SENSOR_STUCK, f"{channel} stays at {value} while {other} went by {went_K:.2f} K")
 
-    return remembering(step)
+    return make_stateful_rule(step)

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.stand.config.chamber_section import CameraCrosscheckConfig, GraniteCrosscheckConfig
-from thermostand.stand.fault import Fault, Readings, Rule, value_of
-from thermostand.stand.guarding.plausibility import remembering
+from thermostand.stand.fault import Fault, Readings, Rule, get_value
+from thermostand.stand.guarding.plausibility import make_stateful_rule
 
 AIR_WARMER_THAN_SHOWN = guard_rule(
     "air_warmer_than_shown", "a body in the chamber warms as if the air were warmer than shown"
@@ -31,7 +31,7 @@ _GAP_S = 60.0  # between two readings; after a longer one the window begins agai
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class CrosscheckSample:
     """What body and probe showed at one time."""
 
     time_ns: int
@@ -40,7 +40,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Felt:
+class AirEstimate:
     """Over one window: the air as the body feels it, as the probe shows it, and the body itself, degC; what the probe
     has risen, K. uncertain_K: of the air that is felt, by the scatter of the body, with k = 3."""
 
@@ -59,10 +59,10 @@ class Felt:
         return self.air_degC - self.probe_degC - allowed_K
 
 
-def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
+def estimate_air(looks: Sequence[CrosscheckSample], window_s: float, lag_s: float) -> AirEstimate | None:
     """What a window says of the air around a body of that lag; None before it is full. One wild value of the body
     changes nothing: medians of three."""
-    if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * seconds_ns(window_s):
+    if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * to_ns(window_s):
         return None
     read_degC = [look.body_degC for look in looks]
     bodies_degC = [sorted(three)[1] for three in zip(read_degC, read_degC[1:], read_degC[2:], strict=False)]
@@ -74,42 +74,44 @@ def felt(looks: Sequence[Look], window_s: float, lag_s: float) -> Felt | None:
     bends_K2 = [(c - 2 * b + a) ** 2 for a, b, c in zip(read_degC, read_degC[1:], read_degC[2:], strict=False)]
     probe_degC, risen_K = fmean(look.probe_degC for look in looks), looks[-1].probe_degC - looks[0].probe_degC
     uncertain_K = _COVERAGE * lag_s * math.sqrt(fmean(bends_K2) / 6 / spread_s2)  # 6: of white noise
-    return Felt(body_degC + lag_s * rate_K_s, probe_degC, body_degC, risen_K, uncertain_K)
+    return AirEstimate(body_degC + lag_s * rate_K_s, probe_degC, body_degC, risen_K, uncertain_K)
 
 
-def looked(looks: tuple[Look, ...], readings: Readings, body: str, probe: str, window_s: float) -> tuple[Look, ...]:
+def update_window(
+    looks: tuple[CrosscheckSample, ...], readings: Readings, body: str, probe: str, window_s: float
+) -> tuple[CrosscheckSample, ...]:
     """The window with what is new, if that is a measurement which is not in doubt; a new one after a gap."""
-    reading, probe_degC = readings.latest(body), value_of(readings, probe)
+    reading, probe_degC = readings.latest(body), get_value(readings, probe)
     if reading is None or math.isnan(reading.value) or reading.cause == "doubt" or math.isnan(probe_degC):
         return looks
     if looks and reading.time_ns <= looks[-1].time_ns:
         return looks
-    if looks and reading.time_ns - looks[-1].time_ns > seconds_ns(_GAP_S):
+    if looks and reading.time_ns - looks[-1].time_ns > to_ns(_GAP_S):
         looks = ()
-    oldest_ns = reading.time_ns - seconds_ns(window_s)
+    oldest_ns = reading.time_ns - to_ns(window_s)
     kept = tuple(look for look in looks if look.time_ns >= oldest_ns)
-    return (*kept, Look(reading.time_ns, reading.value, probe_degC))
+    return (*kept, CrosscheckSample(reading.time_ns, reading.value, probe_degC))
 
 
 @dataclass(frozen=True, slots=True)
-class GraniteSeen:
+class GraniteState:
     """The window; by how much the air that is felt was lately above the probe, and the probe above the granite, K: None
     before the first window is full."""
 
-    looks: tuple[Look, ...] = ()
+    looks: tuple[CrosscheckSample, ...] = ()
     lately_K: float | None = None
     lately_apart_K: float = 0.0
 
-    def then(self, looks: tuple[Look, ...], found: Felt) -> GraniteSeen:
+    def update(self, looks: tuple[CrosscheckSample, ...], found: AirEstimate) -> GraniteState:
         """What was lately, with one more window in it."""
         above_K, apart_K = found.air_degC - found.probe_degC, found.probe_degC - found.body_degC
         if self.lately_K is None or not self.looks:
-            return GraniteSeen(looks, above_K, apart_K)
-        share = min(1.0, (looks[-1].time_ns - self.looks[-1].time_ns) / seconds_ns(_CHANGE_S))
+            return GraniteState(looks, above_K, apart_K)
+        share = min(1.0, (looks[-1].time_ns - self.looks[-1].time_ns) / to_ns(_CHANGE_S))
         lately_K = self.lately_K + share * (above_K - self.lately_K)
-        return GraniteSeen(looks, lately_K, self.lately_apart_K + share * (apart_K - self.lately_apart_K))
+        return GraniteState(looks, lately_K, self.lately_apart_K + share * (apart_K - self.lately_apart_K))
 
-    def change_K(self, found: Felt, limits: GraniteCrosscheckConfig) -> float:
+    def compute_change_K(self, found: AirEstimate, limits: GraniteCrosscheckConfig) -> float:
         """How far the air that is felt has gone from the probe lately, beyond what is allowed. The error of the lag has
         been there before, and so does not count."""
         if self.lately_K is None:
@@ -119,75 +121,75 @@ class GraniteSeen:
         return found.air_degC - found.probe_degC - self.lately_K - allowed_K
 
 
-def granite_feels(limits: GraniteCrosscheckConfig, lag_s: float, granite: str, probe: str) -> Rule:
+def crosscheck_by_granite(limits: GraniteCrosscheckConfig, lag_s: float, granite: str, probe: str) -> Rule:
     """The granite warms as in air that is warmer than `probe` shows, which is stuck, drifts, or hangs outside."""
 
-    def step(last: GraniteSeen | None, readings: Readings, now_ns: int) -> tuple[GraniteSeen | None, Fault | None]:
-        last = last or GraniteSeen()
-        looks = looked(last.looks, readings, granite, probe, _GRANITE_WINDOW_S)
-        found = felt(looks, _GRANITE_WINDOW_S, lag_s)
+    def step(last: GraniteState | None, readings: Readings, now_ns: int) -> tuple[GraniteState | None, Fault | None]:
+        last = last or GraniteState()
+        looks = update_window(last.looks, readings, granite, probe, _GRANITE_WINDOW_S)
+        found = estimate_air(looks, _GRANITE_WINDOW_S, lag_s)
         if found is None:
             return replace(last, looks=looks), None
-        if found.excess_K(limits.limit_K, _GRANITE_SHARE) > 0 or last.change_K(found, limits) > 0:
-            return replace(last, looks=looks), _objection(found, granite, probe)
-        return last.then(looks, found), None
+        if found.excess_K(limits.limit_K, _GRANITE_SHARE) > 0 or last.compute_change_K(found, limits) > 0:
+            return replace(last, looks=looks), _make_fault(found, granite, probe)
+        return last.update(looks, found), None
 
-    return remembering(step)
+    return make_stateful_rule(step)
 
 
-def _objection(found: Felt, body: str, probe: str) -> Fault:
+def _make_fault(found: AirEstimate, body: str, probe: str) -> Fault:
     text = f"{body} warms as in air of {found.air_degC:.1f} degC, but {probe} shows {found.probe_degC:.1f} degC"
     return Fault(AIR_WARMER_THAN_SHOWN, text)
 
 
 @dataclass(frozen=True, slots=True)
-class CameraSeen:
+class CameraState:
     """The camera since `on_since_ns`; its excess over the air, K, None until it is learned from `excesses_K`. The air
     shown when its temperature last changed, at `changed_ns`."""
 
     on_since_ns: int
     changed_ns: int
     changed_air_degC: float
-    looks: tuple[Look, ...] = ()
+    looks: tuple[CrosscheckSample, ...] = ()
     excesses_K: tuple[float, ...] = ()
     excess_K: float | None = None
 
-    def is_doubted(self, air_degC: float) -> bool:
+    def is_implausible(self, air_degC: float) -> bool:
         """Whether the camera did not notice what the air did."""
         still_ns = self.looks[-1].time_ns - self.changed_ns if self.looks else 0
         moved_K = abs(air_degC - self.changed_air_degC)
-        return still_ns >= seconds_ns(_CAMERA_WINDOW_S) and moved_K >= _STILL_AIR_K
+        return still_ns >= to_ns(_CAMERA_WINDOW_S) and moved_K >= _STILL_AIR_K
 
 
 _EXCESSES = 100  # looks from which the camera's excess is learned
 
 
-def camera_feels(limits: CameraCrosscheckConfig, lag_s: float, camera: str, air: str) -> Rule:
+def crosscheck_by_camera(limits: CameraCrosscheckConfig, lag_s: float, camera: str, air: str) -> Rule:
     """The camera, which heats itself by what was learned when it had been on for a while, warms as in air that is
     warmer than `air` shows. Blind while it is off and warms up, and while it does not move though the air does."""
 
-    def step(last: CameraSeen | None, readings: Readings, now_ns: int) -> tuple[CameraSeen | None, Fault | None]:
-        air_degC = value_of(readings, air)
-        looks = looked(last.looks if last else (), readings, camera, air, _CAMERA_WINDOW_S)
+    def step(last: CameraState | None, readings: Readings, now_ns: int) -> tuple[CameraState | None, Fault | None]:
+        air_degC = get_value(readings, air)
+        looks = update_window(last.looks if last else (), readings, camera, air, _CAMERA_WINDOW_S)
         if not looks:
             return None, None
         if last is None or len(looks) == 1:  # also after it was off
-            return CameraSeen(looks[-1].time_ns, looks[-1].time_ns, air_degC, looks), None
-        seen = _seen(last, looks)
-        if seen.is_doubted(air_degC):
+            return CameraState(looks[-1].time_ns, looks[-1].time_ns, air_degC, looks), None
+        seen = _update_camera(last, looks)
+        if seen.is_implausible(air_degC):
             return seen, None
-        found = felt(looks, _CAMERA_WINDOW_S, lag_s)
-        if found is None or looks[-1].time_ns - seen.on_since_ns < seconds_ns(limits.settle_s):
+        found = estimate_air(looks, _CAMERA_WINDOW_S, lag_s)
+        if found is None or looks[-1].time_ns - seen.on_since_ns < to_ns(limits.settle_s):
             return seen, None
         if seen.excess_K is None:
-            return (seen if seen is last else _learned(seen, found)), None
+            return (seen if seen is last else _learn_excess(seen, found)), None
         own = replace(found, air_degC=found.air_degC - seen.excess_K, body_degC=found.body_degC - seen.excess_K)
-        return seen, _objection(own, camera, air) if own.excess_K(limits.limit_K, _CAMERA_SHARE) > 0 else None
+        return seen, _make_fault(own, camera, air) if own.excess_K(limits.limit_K, _CAMERA_SHARE) > 0 else None
 
-    return remembering(step)
+    return make_stateful_rule(step)
 
 
-def _seen(last: CameraSeen, looks: tuple[Look, ...]) -> CameraSeen:
+def _update_camera(last: CameraState, looks: tuple[CrosscheckSample, ...]) -> CameraState:
     if looks is last.looks:
         return last
     newest = looks[-1]
@@ -196,7 +198,7 @@ def _seen(last: CameraSeen, looks: tuple[Look, ...]) -> CameraSeen:
     return replace(last, looks=looks, changed_ns=newest.time_ns, changed_air_degC=newest.probe_degC)
 
 
-def _learned(seen: CameraSeen, found: Felt) -> CameraSeen:
+def _learn_excess(seen: CameraState, found: AirEstimate) -> CameraState:
     excesses_K = (*seen.excesses_K, found.air_degC - found.probe_degC)
     if len(excesses_K) < _EXCESSES:
         return replace(seen, excesses_K=excesses_K)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.events import COOL_DOWN_UNSURE, COOLED_DOWN
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Quality, Reading
@@ -26,7 +26,7 @@ class CameraTemperature:
         return CameraTemperature(air_degC + (self.camera_degC - air_degC) * decayed, time_ns)
 
 
-def last_temperature(reading: Reading | None) -> CameraTemperature | None:
+def get_last_temperature(reading: Reading | None) -> CameraTemperature | None:
     """The last temperature of a camera that is about to be switched off; None when it gave none."""
     if reading is None or reading.quality is not Quality.GOOD:
         return None
@@ -42,7 +42,7 @@ async def cool_down(
     "cooled_down" and "cool_down_unsure" (a warning) say how it ended.
     """
     begin_ns = clock.now_ns()
-    deadline_ns = begin_ns + seconds_ns(max_s)
+    deadline_ns = begin_ns + to_ns(max_s)
     if cooling is None:
         await clock.sleep_until(deadline_ns)
         text = f"the camera gave no temperature before it was switched off; waited {max_s:g} s"
@@ -56,7 +56,7 @@ async def cool_down(
             excess_K = cooling.camera_degC - air.value
         if abs(excess_K) <= band_K or now_ns >= deadline_ns:
             break
-        await clock.sleep_until(min(deadline_ns, now_ns + seconds_ns(_LOOK_S)))
+        await clock.sleep_until(min(deadline_ns, now_ns + to_ns(_LOOK_S)))
     waited_s = (now_ns - begin_ns) / NS_PER_S
     if abs(excess_K) <= band_K:
         hub.publish(COOLED_DOWN.at(now_ns, waited_s=waited_s, excess_K=excess_K, band_K=band_K))

@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 from thermostand.drivers.devices.protocols import Switches
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.drivers.settings import EquilibriumSettings
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.foundation.events import CAMERA_SUPPLY_OFF
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.tasks import cancelled
+from thermostand.foundation.tasks import cancel_all
 from thermostand.stand.gate import CAMERA_LOST, Gate
-from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
-from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S, CameraOpening
+from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, get_last_temperature
+from thermostand.stand.imaging.camera_recovery import LOST_LIMIT_S, RETRY_S, CameraRecovery
 from thermostand.stand.imaging.cameras import Cameras
 from thermostand.stand.imaging.equilibrium import CAMERA, CameraEquilibrium
 from thermostand.stand.interlock import Interlock
@@ -66,7 +66,7 @@ class CameraSupply:
         self._hub = hub
         self._clock = clock
         self.equilibrium = CameraEquilibrium(limits.equilibrium, hub, clock)
-        self.opening = CameraOpening(cameras, hub, clock, lambda: self.is_on, self.equilibrium.lose)
+        self.recovery = CameraRecovery(cameras, hub, clock, lambda: self.is_on, self.equilibrium.lose)
 
     async def switch_on(self) -> None:
         """Return when the camera is open and configured."""
@@ -74,10 +74,10 @@ class CameraSupply:
         self.last = None
         await self._supply()
         self.is_on = True
-        self.tell_identities()
+        self.publish_identities()
         self.equilibrium.begin()
 
-    def tell_identities(self) -> None:
+    def publish_identities(self) -> None:
         """Which cameras are on, for the recording; nothing when one was lost meanwhile."""
         if self._cameras.is_usable:
             for event in self._cameras.identities(self._clock.now_ns()):
@@ -87,7 +87,7 @@ class CameraSupply:
         """Close the camera, then switch it off."""
         self._interlock.check()
         # A camera that was off already has no newer temperature.
-        self.last = last_temperature(self._hub.known(CAMERA)) or self.last
+        self.last = get_last_temperature(self._hub.known(CAMERA)) or self.last
         self.is_on = False
         await self._cameras.close()
         await self._relays.switch(CAMERA_POWER, on=False)
@@ -102,7 +102,7 @@ class CameraSupply:
         gate being held. Nothing on a stand without cameras."""
         if self.is_on or not self._cameras.names:
             return
-        deadline_ns = self._clock.now_ns() + seconds_ns(LOST_LIMIT_S)
+        deadline_ns = self._clock.now_ns() + to_ns(LOST_LIMIT_S)
         self._gate.hold(CAMERA_LOST)
         try:
             while not self.is_on:
@@ -141,22 +141,22 @@ class CameraSupply:
             await relays.hold_on(CAMERA_POWER, hold_s)
             holding = asyncio.create_task(self._hold(hold_s))
         try:
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._limits.boot_s))
-            deadline_ns = self._clock.now_ns() + seconds_ns(_BOOT_LIMIT_S)
-            await self.opening.until_open(self._interlock.check, deadline_ns, RETRY_S)
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(self._limits.boot_s))
+            deadline_ns = self._clock.now_ns() + to_ns(_BOOT_LIMIT_S)
+            await self.recovery.open_with_retries(self._interlock.check, deadline_ns, RETRY_S)
         except BaseException as error:
             if holding is not None:
-                await cancelled([holding])
+                await cancel_all([holding])
                 await relays.switch(CAMERA_POWER, on=False)
                 if isinstance(error, Unreachable):
-                    raise Unreachable(error.device, f"{error.text}; {self._relay_in_doubt()}") from error
+                    raise Unreachable(error.device, f"{error.text}; {self._explain_relay()}") from error
             raise
         if holding is not None:
-            await cancelled([holding])
+            await cancel_all([holding])
             self._interlock.check()
             await relays.switch(CAMERA_POWER, on=True)
 
-    def _relay_in_doubt(self) -> str:
+    def _explain_relay(self) -> str:
         """What to look at when the camera does not answer though its relay was switched on: it may be another one."""
         channels = self._limits.channels
         others = ", ".join(f"{name} is {number}" for name, number in channels.items() if name != CAMERA_POWER)
@@ -169,6 +169,6 @@ class CameraSupply:
     async def _hold(self, hold_s: float) -> None:
         """Arm the supply again until cancelled; a lost command is made up for by the next one."""
         while True:
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(hold_s / 3))
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(hold_s / 3))
             with suppress(DeviceError):
                 await self._relays.hold_on(CAMERA_POWER, hold_s)

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Coroutine, Mapping
 
 from thermostand.drivers.devices.protocols import Camera
-from thermostand.drivers.settings import identity_event
+from thermostand.drivers.settings import make_identity_event
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Event
 
@@ -30,7 +30,7 @@ class Cameras:
 
     def identities(self, now_ns: int) -> tuple[Event, ...]:
         """Which have answered, as events; Unreachable when one is not open."""
-        return tuple(identity_event(each.name, each.identity, now_ns, each.settings) for each in self._cameras)
+        return tuple(make_identity_event(each.name, each.identity, now_ns, each.settings) for each in self._cameras)
 
     async def open(self) -> None:
         """Open every camera, those that are open already again."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from thermostand.drivers.settings import EquilibriumSettings
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.events import (
     CAMERA_EQUILIBRIUM,
     CAMERA_EQUILIBRIUM_LATE,
@@ -24,7 +24,7 @@ from thermostand.foundation.events import (
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Item
 from thermostand.foundation.readings import Quality
-from thermostand.stand.imaging.settling import Float, camera_rate, digit_K, seconds
+from thermostand.stand.imaging.settling import Float, find_digit_K, fit_camera_rate, to_seconds
 
 CAMERA = "camera.temperature"
 # 0.7 % of a step are left then; half of it leaves 8 %, twice holds a run without a temperature for twice as long.
@@ -34,7 +34,7 @@ _UNKNOWN_S = 60.0  # without a reading; a longer gap leaves open what happened i
 
 
 class CameraEquilibrium:
-    """Of one camera; `is_lost` from `lose` until `regained` has returned, or `forget`."""
+    """Of one camera; `is_lost` from `lose` until `wait_until_regained` has returned, or `forget`."""
 
     def __init__(self, limits: EquilibriumSettings, hub: Hub, clock: Clock) -> None:
         self.is_lost = False
@@ -75,50 +75,50 @@ class CameraEquilibrium:
         """For how long the camera has been soaked since its equilibrium was lost; None when it need not be."""
         return (self._clock.now_ns() - self._since_ns) / NS_PER_S if self.is_lost else None
 
-    async def regained(self, is_disturbed: Callable[[], bool]) -> None:
+    async def wait_until_regained(self, is_disturbed: Callable[[], bool]) -> None:
         """Return when the camera is in equilibrium, with the event `camera_equilibrium`, or when it is disturbed."""
         tell_ns = self._since_ns + self._longest_ns
         while self.is_lost and not is_disturbed():
             now_ns = self._clock.now_ns()
             rate_K_per_min = self._rate_K_per_min(now_ns)
             if self._is_reached(now_ns, rate_K_per_min):
-                return self._reached(now_ns, rate_K_per_min)
+                return self._end_equilibration(now_ns, rate_K_per_min)
             if now_ns >= tell_ns:
                 tell_ns += self._longest_ns
-                self._say(CAMERA_EQUILIBRIUM_LATE, now_ns, rate_K_per_min)
-            await self._clock.sleep_until(now_ns + seconds_ns(_LOOK_S))
+                self._publish(CAMERA_EQUILIBRIUM_LATE, now_ns, rate_K_per_min)
+            await self._clock.sleep_until(now_ns + to_ns(_LOOK_S))
 
     @property
     def _longest_ns(self) -> int:
-        return seconds_ns(_TIME_CONSTANTS * self._limits.time_constant_s)
+        return to_ns(_TIME_CONSTANTS * self._limits.time_constant_s)
 
     def _is_reached(self, now_ns: int, rate_K_per_min: float) -> bool:
         if math.isnan(rate_K_per_min):
-            has_temperature = bool(self._readings) and seconds(now_ns) - self._readings[-1][0] <= _UNKNOWN_S
+            has_temperature = bool(self._readings) and to_seconds(now_ns) - self._readings[-1][0] <= _UNKNOWN_S
             return not has_temperature and now_ns - self._since_ns >= self._longest_ns
         return rate_K_per_min < self._limits.rate_K_per_min
 
     def _rate_K_per_min(self, now_ns: int) -> float:
         """How fast the camera's temperature may have moved within the last `duration_s`; NaN when it was not known
         throughout."""
-        end_s, length_s = seconds(now_ns), self._limits.duration_s
-        if seconds(self._since_ns) > end_s - length_s:
+        end_s, length_s = to_seconds(now_ns), self._limits.duration_s
+        if to_seconds(self._since_ns) > end_s - length_s:
             return math.nan
         readings: Float = np.array([each for each in self._readings if each[0] >= end_s - length_s], np.float64)
         times_s = np.concatenate(([end_s - length_s], readings.reshape(-1, 2)[:, 0], [end_s]))
         if len(readings) < 8 or np.diff(times_s).max() > min(_UNKNOWN_S, length_s / 4):
             return math.nan
-        digit = digit_K(readings[:, 1])
+        digit = find_digit_K(readings[:, 1])
         # An exponential approach is fastest at the window's beginning: its first half must be slow by itself, too.
         first = readings[readings[:, 0] < end_s - length_s / 2]
-        rates = (camera_rate(readings.T, digit).bound, abs(camera_rate(first.T, digit).per_min))
+        rates = (fit_camera_rate(readings.T, digit).bound, abs(fit_camera_rate(first.T, digit).per_min))
         return float(np.max(rates))  # NaN when one of them is
 
-    def _reached(self, now_ns: int, rate_K_per_min: float) -> None:
+    def _end_equilibration(self, now_ns: int, rate_K_per_min: float) -> None:
         self.is_lost = False
-        self._say(CAMERA_EQUILIBRIUM, now_ns, rate_K_per_min)
+        self._publish(CAMERA_EQUILIBRIUM, now_ns, rate_K_per_min)
 
-    def _say(self, kind: EventKind, now_ns: int, rate_K_per_min: float) -> None:
+    def _publish(self, kind: EventKind, now_ns: int, rate_K_per_min: float) -> None:
         soaked_s, rate = (now_ns - self._since_ns) / NS_PER_S, None if math.isnan(rate_K_per_min) else rate_K_per_min
         self._hub.publish(kind.at(now_ns, soaked_s=soaked_s, rate_K_per_min=rate))
 
@@ -128,7 +128,7 @@ class CameraEquilibrium:
             for reading in item.readings:
                 is_good = reading.channel == CAMERA and reading.quality is Quality.GOOD
                 if is_good and reading.time_ns >= self._since_ns:
-                    self._keep(seconds(reading.time_ns), reading.value)
+                    self._keep(to_seconds(reading.time_ns), reading.value)
 
     def _keep(self, time_s: float, camera_degC: float) -> None:
         """As long as a rate is judged by it."""

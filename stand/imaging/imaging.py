@@ -8,15 +8,15 @@ from dataclasses import replace
 from functools import partial
 
 from thermostand.drivers.devices.protocols import Camera, Shutter
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import Unreachable
 from thermostand.foundation.events import CAMERA_BACK, CAMERA_LOST
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, Frame
+from thermostand.foundation.readings import TEMPERATURE_SUSPECT, Frame
 from thermostand.stand import gate as reasons
 from thermostand.stand.config.stand_config import LEADING
 from thermostand.stand.gate import Gate
-from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S, RETRY_S
+from thermostand.stand.imaging.camera_recovery import LOST_LIMIT_S, RETRY_S
 from thermostand.stand.imaging.camera_supply import CameraSupply
 from thermostand.stand.interlock import Interlock, Motions
 
@@ -45,7 +45,9 @@ class Imaging:
         self._hub = hub
         self._clock = clock
         self._moving_flap = asyncio.Lock()  # one command after the other; making safe waits for none
-        self.doubt_of: Callable[[str, float, int], str] = lambda channel, value, time_ns: ""  # of a temperature
+        self.judge_temperature: Callable[[str, float, int], str] = lambda channel, value, time_ns: (
+            ""
+        )  # of a temperature
         self._without_camera_ns = 0  # how long a lost camera was waited for since its last frame
         self._exposed_ns = 0  # when the last exposure ended
 
@@ -114,7 +116,7 @@ class Imaging:
             await self._clock.sleep_until(self._exposed_ns)
         cameras = [camera for name, camera in self._cameras.items() if not names or name in names]
         frames = await grab_together(cameras, self._clock, exposure_s, due_ns)
-        self._exposed_ns = max((frame.time_ns + seconds_ns(frame.exposure_s / 2) for frame in frames), default=0)
+        self._exposed_ns = max((frame.time_ns + to_ns(frame.exposure_s / 2) for frame in frames), default=0)
         return frames
 
     def _publish(self, frames: Iterable[Frame], step_id: str, flags: tuple[str, ...] = ()) -> dict[str, Frame]:
@@ -123,8 +125,8 @@ class Imaging:
         published: dict[str, Frame] = {}
         for frame in frames:
             name, _, _ = frame.channel.partition(".")
-            is_doubted = self.doubt_of(f"{name}.temperature", frame.camera_degC, frame.time_ns)
-            of_it = (*flags, TEMPERATURE_IN_DOUBT) if is_doubted else flags
+            is_suspect = self.judge_temperature(f"{name}.temperature", frame.camera_degC, frame.time_ns)
+            of_it = (*flags, TEMPERATURE_SUSPECT) if is_suspect else flags
             published[frame.channel] = replace(frame, step_id=step_id, flags=(*frame.flags, *of_it))
             self._hub.publish(published[frame.channel])
         return published
@@ -132,7 +134,7 @@ class Imaging:
     async def _regain(self, lost: Unreachable, exposure_s: float, cameras: Collection[str] = ()) -> None:
         """Hold the gate until the camera, lost for that reason, is open again, or is found to be without supply; the
         second time in a row until it gives a frame, too. `lost` when there was no frame for 30 min of such waiting."""
-        begin_ns, limit_ns = self._clock.now_ns(), seconds_ns(LOST_LIMIT_S)
+        begin_ns, limit_ns = self._clock.now_ns(), to_ns(LOST_LIMIT_S)
         if self._without_camera_ns >= limit_ns:
             raise lost
         self._hub.publish(CAMERA_LOST.at(begin_ns, str(lost)))
@@ -144,12 +146,12 @@ class Imaging:
             # begin with each try, and the flap would never be shut in it.
             proof = partial(self._grab, exposure_s, 0, cameras)
         try:
-            is_back = await supply.opening.until_open(
+            is_back = await supply.recovery.open_with_retries(
                 self._interlock.check, deadline_ns, is_vain=lambda: not supply.is_on, proof=proof
             )
         finally:
             self._gate.clear(reasons.CAMERA_LOST)
-            self._without_camera_ns += max(self._clock.now_ns() - begin_ns, seconds_ns(RETRY_S))
+            self._without_camera_ns += max(self._clock.now_ns() - begin_ns, to_ns(RETRY_S))
         if is_back:
             self._hub.publish(CAMERA_BACK.at(self._clock.now_ns(), "the camera answers again"))
 

@@ -44,11 +44,11 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True)
-class SettlingSeen:
+class SettlingData:
     """Readings and looks since the soak was last undisturbed, oldest first, times in s.
 
     chamber, camera: (2, n), time and degC, NaN where a reading was BAD. digit_K: of the camera's thermometer, 0 when it
-    never moved. looks: (n, 6), time, the four of `movement` added up, and their standard uncertainty.
+    never moved. looks: (n, 6), time, the four of `measure_movement` added up, and their standard uncertainty.
     """
 
     chamber: Float
@@ -79,18 +79,20 @@ class Verdict:
         )
 
 
-def judge(seen: SettlingSeen, soak: SoakUntilSettled, now_s: float) -> Verdict:
+def judge_settling(seen: SettlingData, soak: SoakUntilSettled, now_s: float) -> Verdict:
     """Whether the camera has settled, by the last `soak.window_s` before `now_s`; the soak's age is not judged."""
-    camera = camera_rate(_last(seen.camera, now_s - soak.window_s), seen.digit_K)
+    camera = fit_camera_rate(_select_last(seen.camera, now_s - soak.window_s), seen.digit_K)
     slack_s = soak.look_every_s / 2.0
     looks = seen.looks[seen.looks[:, 0] >= now_s - soak.window_s - slack_s]
-    drift = drift_rate(looks[:, 0], looks[:, 1:5], looks[:, 5])
-    return Verdict(camera, drift, _missing(seen, soak, now_s, looks, camera, drift))
+    drift = fit_drift_rate(looks[:, 0], looks[:, 1:5], looks[:, 5])
+    return Verdict(camera, drift, _find_missing(seen, soak, now_s, looks, camera, drift))
 
 
-def _missing(seen: SettlingSeen, soak: SoakUntilSettled, now_s: float, looks: Float, camera: Rate, drift: Rate) -> str:
+def _find_missing(
+    seen: SettlingData, soak: SoakUntilSettled, now_s: float, looks: Float, camera: Rate, drift: Rate
+) -> str:
     begin_s = now_s - soak.window_s
-    chamber = _last(seen.chamber, begin_s)
+    chamber = _select_last(seen.chamber, begin_s)
     if not _covers(seen.chamber, begin_s) or not (np.abs(chamber[1] - soak.chamber_degC) <= BAND_K).all():
         return f"the chamber was not within {BAND_K:g} K of its set-point for {soak.window_s / 60:g} min"
     if not _covers(seen.camera, begin_s) or math.isnan(camera.bound):
@@ -104,7 +106,7 @@ def _missing(seen: SettlingSeen, soak: SoakUntilSettled, now_s: float, looks: Fl
     return ""
 
 
-def camera_rate(readings: Float, digit_K: float) -> Rate:
+def fit_camera_rate(readings: Float, digit_K: float) -> Rate:
     """K/min of readings (2, n) in s and degC by a straight line; NaN with fewer than three or a BAD one.
 
     Rounding does not average out while all readings show the same digit or two: it counts with what covers 95 % of the
@@ -122,7 +124,7 @@ def camera_rate(readings: Float, digit_K: float) -> Rate:
     return Rate(slope, math.hypot(scatter, rounding))
 
 
-def drift_rate(time_s: Float, moved_px: Float, uncertainty_px: Float) -> Rate:
+def fit_drift_rate(time_s: Float, moved_px: Float, uncertainty_px: Float) -> Rate:
     """px/min of positions (n, quantities) by a parabola each: the largest, over quantities and within the time seen.
 
     `uncertainty_px` (n,) is that of a position; where positions scatter more than that, their scatter counts (Birge's
@@ -148,7 +150,7 @@ def drift_rate(time_s: Float, moved_px: Float, uncertainty_px: Float) -> Rate:
     return max(rates, key=lambda rate: rate.bound)
 
 
-def movement(before: Detection, now: Detection) -> tuple[Float, float] | None:
+def measure_movement(before: Detection, now: Detection) -> tuple[Float, float] | None:
     """How the image has moved since `before`, px: along I and J, and by growing and turning, those two as the RMS over
     the markers; and the standard uncertainty of the position `now`. None when too few markers are seen in both.
 
@@ -167,13 +169,13 @@ def movement(before: Detection, now: Detection) -> tuple[Float, float] | None:
     return moved, math.sqrt(float(variance_px2.mean()) / int(both.sum()))
 
 
-def digit_K(camera_degC: Float) -> float:
+def find_digit_K(camera_degC: Float) -> float:
     """The smallest step between readings (n,), 0 when there is none."""
     steps = np.abs(np.diff(camera_degC[np.isfinite(camera_degC)]))
     return float(steps[steps > 0.0].min(initial=math.inf)) if (steps > 0.0).any() else 0.0
 
 
-def _last(readings: Float, begin_s: float) -> Float:
+def _select_last(readings: Float, begin_s: float) -> Float:
     return readings[:, readings[0] >= begin_s]
 
 
@@ -182,6 +184,6 @@ def _covers(readings: Float, begin_s: float) -> bool:
     return readings.shape[1] > 0 and bool(readings[0, 0] <= begin_s)
 
 
-def seconds(time_ns: int) -> float:
+def to_seconds(time_ns: int) -> float:
     """An instant as s, for the arrays here; a double holds it to less than a us."""
     return time_ns / NS_PER_S

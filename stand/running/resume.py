@@ -3,7 +3,7 @@
 The journal says what was done, the recording what it produced: a step whose end is recorded is done, and a frame
 counts when its image and its description are both on the disk. What only the recording proves is put between the
 journal's entries, and all of them are folded into the state from which the run is resumed. Recipe, seed and target are
-those of the session, not today's files; the stand is this one (stand.running.opening.own_stand).
+those of the session, not today's files; the stand is this one (stand.running.opening.resume_config).
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from thermostand.experiments.steps import Capture, PlannedStep
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import PLAN_CHANGED, RUN_BEGINS, RUN_END
 from thermostand.foundation.items import Event, Item, StepMark, StepState
-from thermostand.foundation.progress import late_progress
-from thermostand.recording.format.journal_lines import text_hash
+from thermostand.foundation.progress import show_late_progress
+from thermostand.recording.format.capture_restarts import count_frames_lost, find_restarted_step
+from thermostand.recording.format.journal_lines import hash_text
 from thermostand.recording.format.manifest import SessionInfo
-from thermostand.recording.format.restarts import frames_lost_of, restarted_step
 from thermostand.recording.reading.recorded_devices import recorded_devices
-from thermostand.recording.reading.run_word import RunOutcome, last_run_event
+from thermostand.recording.reading.run_status import RunOutcome, find_last_run_event
 from thermostand.recording.reading.scan import scan
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
-from thermostand.stand.assembly import recorded_devices as declared_devices
+from thermostand.stand.assembly import list_recorded_devices as declared_devices
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.running.executing.actions import cold_start
-from thermostand.stand.running.executing.camera_gap import CameraBefore, camera_before
+from thermostand.stand.running.executing.actions import find_cold_start_steps
+from thermostand.stand.running.executing.camera_gap import CameraHistory, load_camera_history
 from thermostand.stand.running.memory.entries import (
     Again,
     Begun,
     Ended,
     Entry,
+    JournalEntry,
     StepChanged,
     Taken,
     Tripped,
-    Written,
-    change_of,
+    parse_change,
 )
-from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.fold import apply_entry, fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.running.opening.own_stand import Difference, default_stand, on_this_stand
+from thermostand.stand.running.opening.resume_config import Difference, load_default_stand, make_resume_config
 from thermostand.stand.running.order import Order, parse_order
 
 
-def begun(order: Order, run: str, time_ns: int, seed: int | None) -> Begun:
+def make_begin_entry(order: Order, run: str, time_ns: int, seed: int | None) -> Begun:
     """The first line of a run's journal."""
-    return Begun(time_ns, run, plan_hash(order.recipe.plan()), _text_hashes(order.attachments()), seed)
+    return Begun(time_ns, run, hash_plan(order.recipe.plan()), _hash_texts(order.attachments()), seed)
 
 
-def plan_hash(plan: Iterable[PlannedStep]) -> str:
+def hash_plan(plan: Iterable[PlannedStep]) -> str:
     """The same for the same steps in the same order."""
     return hashlib.sha256("\n".join(planned.step_id for planned in plan).encode()).hexdigest()[:16]
 
 
-def _text_hashes(texts: Mapping[str, str]) -> dict[str, str]:
-    return {name: text_hash(text) for name, text in texts.items()}
+def _hash_texts(texts: Mapping[str, str]) -> dict[str, str]:
+    return {name: hash_text(text) for name, text in texts.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,30 +82,31 @@ class Interruption:
     last_ns: int
     seed: int | None
     salvaged: tuple[Salvaged, ...]
-    camera: CameraBefore
+    camera: CameraHistory
     utc_offset_ns: int = 0
     differences: tuple[Difference, ...] = ()
 
     @property
     def kept(self) -> RunState:
         """What counts of it: without the steps of a warm-up that is restarted."""
-        again = [planned.step_id for planned in cold_start(self.state)]
-        return after(self.state, Again(self.last_ns, again)) if again else self.state
+        again = [planned.step_id for planned in find_cold_start_steps(self.state)]
+        return apply_entry(self.state, Again(self.last_ns, again)) if again else self.state
 
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
         self.journal.release()
 
 
-def repaired(directory: Path) -> tuple[Salvaged, ...]:
-    """What `interruption` would have to write: the journal's torn end is cut off, unfinished segments are finished.
+def repair_session(directory: Path) -> tuple[Salvaged, ...]:
+    """What `load_interruption` would have to write: the journal's partial last line is cut off, unfinished segments are
+    finished.
     SessionError as there. For the process that touches the disk; those that are being recorded are not among them."""
     Journal.open(directory)[0].release()
     found = salvage_unfinished(directory.resolve().parent)
     return tuple(segment for segment in found if segment.reason != BEING_RECORDED)
 
 
-def interruption(directory: Path, own: StandConfig | None = None, *, reset: bool = False) -> Interruption:
+def load_interruption(directory: Path, own: StandConfig | None = None, *, reset: bool = False) -> Interruption:
     """What is needed to resume the run recorded in `directory` on this stand, the installed simulated one when no
     `own` is given; its unfinished segments are salvaged.
 
@@ -114,32 +115,32 @@ def interruption(directory: Path, own: StandConfig | None = None, *, reset: bool
     """
     journal, entries = Journal.open(directory)
     try:
-        return _interruption(directory, journal, entries, own or default_stand(), reset)
+        return _load(directory, journal, entries, own or load_default_stand(), reset)
     except BaseException:
         journal.release()
         raise
 
 
-def _interruption(
-    directory: Path, journal: Journal, entries: list[Written], own: StandConfig, reset: bool
+def _load(
+    directory: Path, journal: Journal, entries: list[JournalEntry], own: StandConfig, reset: bool
 ) -> Interruption:
     first = entries[0] if entries else None
     if not entries or not (isinstance(first, Begun) or journal.damage):
         raise SessionError(f"{directory}: its run had not begun when it was killed; begin a new run")
-    _check_may_go_on(directory, folded((), entries), reset)
-    with late_progress("repair", 1.0) as report:
+    _check_may_go_on(directory, fold_entries((), entries), reset)
+    with show_late_progress("repair", 1.0) as report:
         salvaged = tuple(salvage_unfinished(directory.resolve().parent, report))
     session = Session.open(directory)
-    begun = first if isinstance(first, Begun) else _recorded_begun(session)
-    lost = _recorded_end(session, entries)
+    begun = first if isinstance(first, Begun) else _read_begin(session)
+    lost = _read_end(session, entries)
     items = (*session.steps(), *session.events())
-    without_frames = (*with_recorded(entries, items, ()), *lost)
-    _check_may_go_on(directory, folded((), without_frames), reset)
-    order = _order(session, begun)
-    plan = folded(order.recipe.plan(), without_frames).plan
-    all_entries = (*with_recorded(entries, items, _recorded_frames(session, plan)), *lost)
+    without_frames = (*merge_recorded(entries, items, ()), *lost)
+    _check_may_go_on(directory, fold_entries((), without_frames), reset)
+    order = _load_order(session, begun)
+    plan = fold_entries(order.recipe.plan(), without_frames).plan
+    all_entries = (*merge_recorded(entries, items, _read_frames(session, plan)), *lost)
     info = SessionInfo.of(session.metadata)
-    config, differences = on_this_stand(order.config, own, directory, is_virtual=info.clock_source == "virtual")
+    config, differences = make_resume_config(order.config, own, directory, is_virtual=info.clock_source == "virtual")
     differences = (*differences, *_changed_units(session, config))
     last_ns = max(entries[-1].time_ns, scan(directory).end_ns or 0)
     return Interruption(
@@ -147,11 +148,11 @@ def _interruption(
         replace(order, config=config),
         info,
         journal,
-        folded(order.recipe.plan(), all_entries),
+        fold_entries(order.recipe.plan(), all_entries),
         last_ns,
         begun.seed,
         salvaged,
-        camera_before(session),
+        load_camera_history(session),
         session.utc.at(last_ns),
         differences,
     )
@@ -168,7 +169,7 @@ def _changed_units(session: Session, config: StandConfig) -> Iterator[Difference
                 yield Difference(f"the unit of {name}.{each.name}", units[each.name], each.unit)
 
 
-def folded(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
+def fold_entries(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
     """The state, of entries that may be anybody's; SessionError when they are not what a run has written."""
     try:
         return fold(plan, entries)
@@ -184,7 +185,7 @@ def _check_may_go_on(directory: Path, state: RunState, reset: bool) -> None:
         raise SessionError(f"{directory}: the stand tripped: {state.tripped}; look into it, then resume with --reset")
 
 
-def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Iterable[tuple[int, str]]) -> list[Entry]:
+def merge_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Iterable[tuple[int, str]]) -> list[Entry]:
     """The entries of a journal, and between them what only the recording proves: by `items` steps that are done,
     captures that were restarted and changes of the plan, by `frames` (instant and step of each) what was captured."""
     done: list[Entry] = []
@@ -194,10 +195,10 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
         if isinstance(item, StepMark) and item.state is StepState.DONE:
             done.append(StepChanged(item.time_ns, item.step_id, "done"))
         if isinstance(item, Event):
-            step_id = restarted_step(item)
+            step_id = find_restarted_step(item)
             if step_id and (item.time_ns, step_id) not in known:
-                others.append(Again(item.time_ns, [step_id], frames_lost_of(item)))
-            change = change_of(item.time_ns, item.data) if item.kind == PLAN_CHANGED else None
+                others.append(Again(item.time_ns, [step_id], count_frames_lost(item)))
+            change = parse_change(item.time_ns, item.data) if item.kind == PLAN_CHANGED else None
             if change is not None and change not in entries:
                 others.append(change)
     instant = attrgetter("time_ns")
@@ -206,7 +207,7 @@ def with_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Itera
     return list(merge(sorted(done, key=instant), entries, others, key=instant))
 
 
-def _recorded_frames(session: Session, plan: Iterable[PlannedStep]) -> list[tuple[int, str]]:
+def _read_frames(session: Session, plan: Iterable[PlannedStep]) -> list[tuple[int, str]]:
     """Instant and step of the captures' frames that are on the disk; looks are none. Of several cameras those of the
     one with the fewest: it is the last to have its frame."""
     metas = session.frame_metas()
@@ -221,10 +222,10 @@ def _recorded_frames(session: Session, plan: Iterable[PlannedStep]) -> list[tupl
     return found
 
 
-def _recorded_end(session: Session, entries: Sequence[Entry]) -> tuple[Entry, ...]:
+def _read_end(session: Session, entries: Sequence[Entry]) -> tuple[Entry, ...]:
     """The end of the run by the recording, when its journal has lost that: it says so in damaged lines, or not at all
     when it is the last flush that the disk has lost."""
-    event = last_run_event(session.events())
+    event = find_last_run_event(session.events())
     if isinstance(entries[-1], Ended) or event is None or event.kind != RUN_END or event.time_ns < entries[-1].time_ns:
         return ()
     status = event.data.get("status")
@@ -233,12 +234,12 @@ def _recorded_end(session: Session, entries: Sequence[Entry]) -> tuple[Entry, ..
     return (Ended(event.time_ns, "complete", event.text),) if status == RunOutcome.COMPLETE else ()
 
 
-def _recorded_begun(session: Session) -> Begun:
+def _read_begin(session: Session) -> Begun:
     """The first line of a journal that has lost it, from what the recording says; SessionError when it does not."""
     for event in session.events():
         plan, seed = event.data.get("plan"), event.data.get("seed")
         if event.kind in RUN_BEGINS and isinstance(plan, str) and isinstance(seed, int | None):
-            texts = _text_hashes(session.attachments)
+            texts = _hash_texts(session.attachments)
             return Begun(event.time_ns, session.metadata.get("session_id", ""), plan, texts, seed)
     raise SessionError(
         f"{session.path}: the line of its journal that says what was run is damaged, and the recording does not say "
@@ -246,13 +247,13 @@ def _recorded_begun(session: Session) -> Begun:
     )
 
 
-def _order(session: Session, first: Begun) -> Order:
+def _load_order(session: Session, first: Begun) -> Order:
     """What was to be run, from the texts in the session; SessionError when they are not those the run began with."""
     texts = dict(session.attachments)
-    if _text_hashes(texts) != first.texts:
+    if _hash_texts(texts) != first.texts:
         raise SessionError(f"{session.path}: the attached files are not those its run began with")
     order = parse_order(texts, {name: f"{session.path}: {name}" for name in texts})
-    if plan_hash(order.recipe.plan()) != first.plan:
+    if hash_plan(order.recipe.plan()) != first.plan:
         raise SessionError(
             f"{session.path}: this version of thermostand makes another plan of its recipe; begin a new run"
         )

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from thermostand.drivers.settings import identity_event
+from thermostand.drivers.settings import make_identity_event
 from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.events import ABSENT, SEARCH_FAILED
@@ -24,13 +24,13 @@ from thermostand.recording.format.images import MarkerWindows
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
-from thermostand.stand.assembly import Assembly, recorded_devices
+from thermostand.stand.assembly import Assembly, list_recorded_devices
 from thermostand.stand.config.stand_config import RecordingConfig, StandConfig
-from thermostand.stand.estimating.absent import absences
+from thermostand.stand.estimating.missing_devices import list_missing_devices
 from thermostand.stand.running.order import Order
 
 
-def session_directory(out: Path, order: Order, clock: Clock) -> Path:
+def choose_session_directory(out: Path, order: Order, clock: Clock) -> Path:
     """A new folder for the session below `out`, named for the instant and the recipe; `-2`, `-3` ... when there is one
     already: in virtual time every run of a recipe begins at the same instant."""
     started = datetime.fromtimestamp(clock.now_ns() / NS_PER_S, UTC)
@@ -39,7 +39,7 @@ def session_directory(out: Path, order: Order, clock: Clock) -> Path:
     return next(directory for directory in map(out.joinpath, names) if not os.path.lexists(directory))
 
 
-def info_of(
+def make_session_info(
     recipe: str, session: str, config: StandConfig, camera_serial: str, clock: Clock, seed: int | None = None
 ) -> SessionInfo:
     """Who records what with which; `seed`: of a run in virtual time."""
@@ -57,35 +57,35 @@ def info_of(
     )
 
 
-def camera_serials(assembly: Assembly) -> str:
+def list_camera_serials(assembly: Assembly) -> str:
     """Which cameras have answered; "" on a stand without any."""
     return ", ".join(camera.identity.serial_number for camera in assembly.devices.cameras.values())
 
 
-def tell_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
+def publish_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
     """Which devices have answered, as events, but for the cameras, which are reported when they are on; and what the
     stand lacks. tell: gets them."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
     for name, device in devices.every.items():
         if name not in devices.cameras and device.identity is not None:
-            tell(identity_event(name, device.identity, now_ns))
-    for absence in absences(assembly.config):
+            tell(make_identity_event(name, device.identity, now_ns))
+    for absence in list_missing_devices(assembly.config):
         tell(ABSENT.at(now_ns, absence.means, what=absence.what))
 
 
-def recorder_of(
+def make_run_recorder(
     order: Order, directory: Path, info: SessionInfo, assembly: Assembly, disk: DiskProcess | None = None
 ) -> Recorder:
     """The recorder of this run; `disk` is the process that touches the disk for it."""
-    windows = _partial_frames(order)
+    windows = _make_marker_windows(order)
     attachments, hub, clock = order.attachments(), assembly.hub, assembly.clock
-    recorder = recorder_in(directory, info, attachments, order.config, hub, clock, disk=disk, windows=windows)
+    recorder = make_recorder(directory, info, attachments, order.config, hub, clock, disk=disk, windows=windows)
     if windows is not None:
         windows.tell = partial(recorder.tell, SEARCH_FAILED)
     return recorder
 
 
-def recorder_in(
+def make_recorder(
     directory: Path,
     info: SessionInfo,
     attachments: Mapping[str, str],
@@ -99,29 +99,29 @@ def recorder_in(
     """A recorder with the stand's settings. `roi` frames need `windows`; without them they are whole."""
     settings = RecordingSettings(
         config.recording.frame_encoding,
-        _commit_s(config.recording, clock),
+        _compute_commit_s(config.recording, clock),
         stop_frames_below_bytes=round(config.recording.stop_frames_below_GB * 1e9),
         alert_below_fraction=config.recording.alert_below_percent / 100,
     )
-    devices = recorded_devices(config)
+    devices = list_recorded_devices(config)
     return Recorder(directory, info, attachments, devices, hub, clock, settings=settings, prepare=windows, disk=disk)
 
 
-def _commit_s(recording: RecordingConfig, clock: Clock) -> float:
+def _compute_commit_s(recording: RecordingConfig, clock: Clock) -> float:
     """Between commits of telemetry: on a virtual clock few, but nothing waits for half of what a guard allows."""
     if isinstance(clock, VirtualClock):
         return min(VIRTUAL_COMMIT_S, recording.durable_within_s / 3)
     return min(recording.telemetry_commit_s, recording.durable_within_s / 3)
 
 
-def _partial_frames(order: Order) -> MarkerWindows | None:
+def _make_marker_windows(order: Order) -> MarkerWindows | None:
     """For `roi`: what keeps the surroundings of the target's markers."""
     recording = order.config.recording
     if recording.frame_encoding != "roi":
         return None
     target = parse_document(order.target_text, Target, order.config.target)
     from thermostand.markers.windows import (
-        marker_windows,
+        find_marker_windows,
     )  # scipy takes half a second that other runs need not wait for
 
-    return MarkerWindows(partial(marker_windows, target=target), recording.whole_every_s)
+    return MarkerWindows(partial(find_marker_windows, target=target), recording.whole_every_s)

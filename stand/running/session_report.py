@@ -9,13 +9,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from thermostand.compensation.design import process
+from thermostand.compensation.design import decision_process
 from thermostand.experiments.steps import Capture, PlannedStep
 from thermostand.foundation.errors import ConfigError, StandError
 from thermostand.foundation.progress import progress
 
 MODEL_NAME, REPORT_NAME = "model.json", "report.html"
-DECIDES = process.decided  # for a process of its own, which imports the rest when it is asked
+DECIDES = decision_process.decide_next_visit  # for a process of its own, which imports the rest when it is asked
 
 
 class Reported(NamedTuple):
@@ -48,8 +48,8 @@ def report_session(session: Path, folder: Path) -> Reported:
     when the frames do not allow it or a file cannot be written; what was recorded is as it was.
     """
     # Figures and fit take half a second to import, which `stand status` need not wait for.
-    from thermostand.compensation.drift.evaluation import table
-    from thermostand.compensation.observations import TwoEquilibria
+    from thermostand.compensation.drift.evaluation import format_table
+    from thermostand.compensation.observations import MixedEquilibria
     from thermostand.compensation.reporting.report import NoModel, analyse
 
     model, report = folder / MODEL_NAME, folder / REPORT_NAME
@@ -58,14 +58,14 @@ def report_session(session: Path, folder: Path) -> Reported:
     except NoModel as error:
         raise NotReported(f"{session} is recorded, but {error}") from error
     except (StandError, OSError) as error:
-        flag = " --across-gap" if isinstance(error, TwoEquilibria) else ""
+        flag = " --across-gap" if isinstance(error, MixedEquilibria) else ""
         remedy = f"`compensate report {session}{flag} -o report.html` tries again"
         raise NotReported(f"{session} is recorded, but not reported: {error}; {remedy}") from error
-    fitted = [] if evaluation is None else [table(evaluation), f"model    {model}"]
-    return Reported(tuple(_moved(report.with_suffix(".json"))), (*fitted, f"report   {report}"))
+    fitted = [] if evaluation is None else [format_table(evaluation), f"model    {model}"]
+    return Reported(tuple(_describe_movements(report.with_suffix(".json"))), (*fitted, f"report   {report}"))
 
 
-def _moved(numbers: Path) -> Iterator[str]:
+def _describe_movements(numbers: Path) -> Iterator[str]:
     """Steps of the image, slips, fixings that settle differently each time."""
     found = json.loads(numbers.read_text())
     for bump in found["bumps"]:

@@ -8,13 +8,13 @@ from contextlib import asynccontextmanager
 
 from thermostand.foundation.errors import ConfigError, Refused, Unreachable
 from thermostand.stand.assembly import Assembly
-from thermostand.stand.serving.desk import Conflict, FaultRequest, Missing, SimulatedFaults
+from thermostand.stand.serving.api_models import Conflict, FaultRequest, Missing, SimulatedFaults
 from thermostand.stand.simulator import ControlSocket
 
 _ANSWERS_S = 5.0  # round number; nothing was measured
 
 
-async def simulated_faults(assembly: Assembly) -> SimulatedFaults:
+async def list_simulated_faults(assembly: Assembly) -> SimulatedFaults:
     """What can be broken, and what is. Conflict when this is a real stand, Unreachable when nobody simulates it."""
     async with _simulator(assembly) as simulator:
         return SimulatedFaults.model_validate(await simulator.request({"do": "faults"}))
@@ -22,7 +22,7 @@ async def simulated_faults(assembly: Assembly) -> SimulatedFaults:
 
 async def break_or_mend(assembly: Assembly, request: FaultRequest) -> str:
     """What came of it, as a sentence. Missing when there is no such fault, ConfigError when the laboratory cannot have
-    it; else as `simulated_faults`."""
+    it; else as `list_simulated_faults`."""
     name, value = request.name, request.value
     async with _simulator(assembly) as simulator:
         try:

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from thermostand.experiments.steps import words_of
-from thermostand.foundation.clock import NS_PER_S, Clock, Now, seconds_ns, utc_offset_ns
+from thermostand.experiments.steps import describe_step
+from thermostand.foundation.clock import NS_PER_S, Clock, Now, to_ns, utc_offset_ns
 from thermostand.foundation.events import ETA_SLIPPED, PLAN_CHANGED
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.instants import local_text
+from thermostand.foundation.instants import format_local
 from thermostand.foundation.items import Batch, Event, Item, StepMark
 from thermostand.foundation.readings import Quality
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.estimating.eta import Eta
-from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.estimating.run_estimate import PlanEstimate
 from thermostand.stand.gate import HELD, RELEASED, Gate, Phase
 from thermostand.stand.latch import Latch
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
-from thermostand.stand.serving.desk import RunStatus
+from thermostand.stand.serving.api_models import RunStatus
 
 # Says when the end of a run moves: an event each time it is later by another tenth of the whole.
 
@@ -48,7 +48,7 @@ class EtaSlip:
             return
         self._end_s = end_s
         end_ns = round(end_s * NS_PER_S)
-        at = local_text(end_ns + self._utc_offset_ns())
+        at = format_local(end_ns + self._utc_offset_ns())
         self._hub.publish(ETA_SLIPPED.at(now_ns, at, later_s=round(later_s, 1), end_ns=end_ns))
 
 
@@ -73,7 +73,7 @@ class StatusBoard:
     def __init__(
         self,
         recipe: str,
-        night: Night,
+        estimate: PlanEstimate,
         state: RunState,
         gate: Gate,
         stop: Stop,
@@ -85,7 +85,7 @@ class StatusBoard:
     ) -> None:
         self._recipe = recipe
         self._soaked_again_s = soaked_again_s
-        self.eta = Eta(night.steps, state.done, state.soaked_s, night.after_s)
+        self.eta = Eta(estimate.steps, state.done, state.soaked_s, estimate.after_s)
         self._gate = gate
         self._stop = stop
         self._latch = latch
@@ -106,7 +106,7 @@ class StatusBoard:
             case StepMark():
                 self.eta.mark(item)
                 self._step = item.index + 1
-                self._doing = words_of(item.kind, item.parameters)
+                self._doing = describe_step(item.kind, item.parameters)
             case Event():
                 self.eta.event(item)
                 if item.level != "info":
@@ -128,12 +128,12 @@ class StatusBoard:
             recipe=self._recipe,
             step=self._step,
             steps=self.eta.count,
-            doing=self._doing_now(),
+            doing=self._describe_step(),
             state=self._state,
             reasons=tuple(sorted(self._gate.reasons)),
             now_ns=now_ns,
             since_ns=self._since_ns,
-            end_ns=None if self._state == "stopping" else now_ns + seconds_ns(self.eta.left_s(now_ns)),
+            end_ns=None if self._state == "stopping" else now_ns + to_ns(self.eta.left_s(now_ns)),
             end_within_s=self.eta.within_s(),
             frames_planned=self.eta.frames,
             temperatures_degC=self._temperatures_degC,
@@ -150,9 +150,9 @@ class StatusBoard:
             fault="" if fault is None else fault.text,
         )
 
-    def _doing_now(self) -> str:
+    def _describe_step(self) -> str:
         """The step under way in words; before that a camera that was off comes to equilibrium."""
-        return doing_in_words(self._doing, self._soaked_again_s(), goes_on=self.eta.goes_on)
+        return describe_doing(self._doing, self._soaked_again_s(), goes_on=self.eta.goes_on)
 
     def left_s(self, now_ns: int) -> float:
         """How long the run still takes, from now on."""
@@ -165,7 +165,7 @@ class StatusBoard:
             self._since_utc_offset_ns = utc_offset_ns(self._clock)
 
 
-def doing_in_words(step: str, soaked_again_s: float | None, *, goes_on: bool) -> str:
+def describe_doing(step: str, soaked_again_s: float | None, *, goes_on: bool) -> str:
     """The step under way, in words, and what it waits for. soaked_again_s: how long a camera that was off has soaked
     again, None when it need not. goes_on: whether a soak goes on beyond its time."""
     if goes_on:

@@ -16,7 +16,7 @@ from typing import cast
 
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.experiments.steps import Capture
-from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, WallClock, to_ns
 from thermostand.foundation.errors import DeviceError, Interrupted, SessionError, StandError, StandTripped
 from thermostand.foundation.events import (
     CAMERA_NOT_OPENED,
@@ -33,28 +33,36 @@ from thermostand.foundation.events import (
 )
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
-from thermostand.foundation.tasks import cancelled, failure_text, watched
+from thermostand.foundation.tasks import cancel_all, describe_failure, run_with_background
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.estimating.learned import learn
+from thermostand.stand.estimating.learned_durations import learn_durations
 from thermostand.stand.fault import Fault
-from thermostand.stand.running.course import keep
-from thermostand.stand.running.executing.settling_watch import load_for
-from thermostand.stand.running.guest import Job
+from thermostand.stand.running.executing.settling_watch import preload_for
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
-from thermostand.stand.running.resume import Interruption, repaired
+from thermostand.stand.running.resume import Interruption, repair_session
+from thermostand.stand.running.run import Job
+from thermostand.stand.running.run_control import save_note
 from thermostand.stand.service import systemd
-from thermostand.stand.service.daemon_file import Counters, KeptCounters, KeptFile
-from thermostand.stand.service.day_record import DayRecord
+from thermostand.stand.service.counters import Counters, CountersFile, StoredCounters
 from thermostand.stand.service.host import Host
-from thermostand.stand.service.orders import Orders, said_of
+from thermostand.stand.service.idle_log import IdleLog
 from thermostand.stand.service.queue_file import QueueEntry
-from thermostand.stand.service.queue_work import Halt, RunNotes, StepWatch, Stopped, drain, interruption_of, is_complete
-from thermostand.stand.service.run import run_in
+from thermostand.stand.service.queue_worker import (
+    Halt,
+    RunNotes,
+    StepWatch,
+    Stopped,
+    drain,
+    is_complete,
+    load_queued_interruption,
+)
+from thermostand.stand.service.run import run_on_stand
+from thermostand.stand.service.run_queue import RunQueue, make_note
 from thermostand.stand.service.stand_service import StandService
-from thermostand.stand.serving.desk import Conflict, QueuedRun, Who
+from thermostand.stand.serving.api_models import Conflict, QueuedRun, Who
 
 # What answers the clients of a stand while inside.
 Front = Callable[[StandService, Hub, WallClock], AbstractAsyncContextManager[object]]
@@ -72,10 +80,10 @@ class Daemon(Host):
     def __init__(
         self,
         open_stand: OpenStand,
-        orders: Orders,
-        record: DayRecord,
-        kept: KeptCounters,
-        keep: KeptFile,
+        orders: RunQueue,
+        record: IdleLog,
+        kept: StoredCounters,
+        keep: CountersFile,
         recorded: Callable[[Path], None] | None = None,
     ) -> None:
         super().__init__(open_stand, orders)
@@ -84,11 +92,11 @@ class Daemon(Host):
         self.record = record
         self.counters = Counters(kept.counters, config.axes, config.chamber.heater_W, self._hub)
         self.service = StandService(self)
-        self.has_guest = False  # from the moment it is let in until it has gone
+        self.has_admitted_run = False  # from the moment it is let in until it has gone
         self._is_draining = False  # until the queue knows how its run has ended
         self._keep = keep
         self._recorded_whole = recorded  # is told of complete runs with frames
-        self._status = systemd.Status()
+        self._status = systemd.StatusNotice()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
         self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe
         self._others: set[asyncio.Task[None]] = set()
@@ -100,17 +108,17 @@ class Daemon(Host):
     @property
     def has_run(self) -> bool:
         """From the moment a run is let in until it has gone."""
-        return self.has_guest
+        return self.has_admitted_run
 
     @property
     def is_leaving(self) -> bool:
         """Whether it has been asked to leave."""
         return self._orders.leaving
 
-    def seen(self) -> dict[str, object]:
+    def get_state_fields(self) -> dict[str, object]:
         """The fields of the state that are a daemon's; disk_free_bytes is 0 when it is not known."""
         recorder = self.record.recorder
-        return super().seen() | {
+        return super().get_state_fields() | {
             "queue_halted": self._orders.queued.halted,
             "counters": {name: round(value, 4) for name, value in self.counters.values.items()},
             "disk_free_bytes": 0 if recorder is None else recorder.disk_free_bytes,
@@ -118,7 +126,7 @@ class Daemon(Host):
 
     def queue(self) -> tuple[QueuedRun, ...]:
         """As Host."""
-        return self._orders.shown()
+        return self._orders.list_runs()
 
     def wake(self) -> None:
         """There may be something to be run."""
@@ -127,16 +135,16 @@ class Daemon(Host):
     def leave(self) -> None:
         """As soon as the stand is confirmed safe; may be called again."""
         if not self._extending:
-            self._extending.append(asyncio.create_task(systemd.extending()))
+            self._extending.append(asyncio.create_task(systemd.keep_extending()))
         self._orders.leaving = True
         self.stop()
         if not self._leaving.is_set():
-            self._beside(self.open_stand.hurry())
+            self._start_task(self.open_stand.start_shutdown_deadline())
         self._leaving.set()
 
     def stop(self) -> None:
         """The stand is made safe at once; a run that has it ends."""
-        for hand in self.hands:
+        for hand in self.manual_tasks:
             hand.cancel()
         if self._orders.stop is not None:
             self._orders.stop(_ENDS if self._orders.leaving else STOPPED)
@@ -147,21 +155,21 @@ class Daemon(Host):
 
     def note(self) -> None:
         """Counters are kept for the next start."""
-        self._keep.note(KeptCounters(counters=dict(self.counters.values)))
+        self._keep.note(StoredCounters(counters=dict(self.counters.values)))
 
     def reset_queue(self) -> None:
         """What halted it has been looked into."""
-        self._beside(self._reset_queue())
+        self._start_task(self._reset_queue())
 
     async def serve(self, front: Front) -> None:
         """Until `leave`; then the stand is safe. Raises what makes that impossible."""
         async with AsyncExitStack() as stack:
-            stack.push_async_callback(cancelled, self._extending)
-            stack.push_async_callback(self._keep.close, self.open_stand.patience)
-            await self._record_day()
+            stack.push_async_callback(cancel_all, self._extending)
+            stack.push_async_callback(self._keep.close, self.open_stand.shutdown_deadline)
+            await self._record_idle()
             stack.push_async_callback(self._end_record)
             stack.callback(self.note)  # written while the record is ended
-            stack.callback(self.open_stand.patience.begin)
+            stack.callback(self.open_stand.shutdown_deadline.begin)
             stack.push_async_callback(self.open_stand.close)
             await self.open_stand.latch.restore()
             self.open_stand.prepare()
@@ -169,25 +177,25 @@ class Daemon(Host):
             self.open_stand.start()
             self.open_stand.guard.look()
             catch_signals(self.leave)
-            await watched(self._serve(front), self.open_stand.tasks)
+            await run_with_background(self._serve(front), self.open_stand.tasks)
 
     async def _serve(self, front: Front) -> None:
         worker = asyncio.create_task(self._work())
-        tasks = [worker, asyncio.create_task(self._look_after()), asyncio.create_task(self._feed())]
+        tasks = [worker, asyncio.create_task(self._supervise()), asyncio.create_task(self._feed_watchdog())]
         try:
             async with front(self.service, self._hub, cast("WallClock", self._clock)):
-                systemd.tell(systemd.READY, "STATUS=idle")
+                systemd.notify_systemd(systemd.READY, "STATUS=idle")
                 try:
-                    await watched(self._left(), tasks)
+                    await run_with_background(self._wait_until_left(), tasks)
                 finally:
-                    await self._end_guest(worker)
+                    await self._end_run(worker)
         finally:
-            await cancelled([*tasks, *self.hands, *self._others])
+            await cancel_all([*tasks, *self.manual_tasks, *self._others])
 
-    async def _left(self) -> None:
+    async def _wait_until_left(self) -> None:
         await self._leaving.wait()
 
-    async def _end_guest(self, worker: asyncio.Task[None]) -> None:
+    async def _end_run(self, worker: asyncio.Task[None]) -> None:
         """The run has made the stand safe, and completed its session, before anything else ends. One that has not
         begun, or waits for a disk after its end, is not waited for."""
         self._orders.leaving = True
@@ -196,8 +204,8 @@ class Daemon(Host):
                 self._orders.stop(_ENDS)
             await asyncio.wait([worker], timeout=_STOPPED_LOOK_S)
         if self._is_draining:
-            await self.open_stand.patience.wait(worker, FINISH_WITHIN_S)
-            await cancelled([worker])  # it says what the queue does not know
+            await self.open_stand.shutdown_deadline.wait(worker, FINISH_WITHIN_S)
+            await cancel_all([worker])  # it says what the queue does not know
         if self._is_given_up:
             self._assembly.stand.safety.give_up()  # forgotten with the run
 
@@ -217,10 +225,12 @@ class Daemon(Host):
                 continue
             self._is_draining = True
             try:
-                await drain(directory, self._run_one, self._clock, self._say, disk, self.open_stand.patience)
-                self._tell(QUEUE_EMPTY)
+                await drain(
+                    directory, self._run_one, self._clock, self._publish_line, disk, self.open_stand.shutdown_deadline
+                )
+                self._publish(QUEUE_EMPTY)
             except Exception as error:  # noqa: BLE001 - whatever ends a run does not end the daemon: the queue is halted
-                self._say(f"the queue is halted: {failure_text(error)}")
+                self._publish_line(f"the queue is halted: {describe_failure(error)}")
                 await self._restart_recording()
             finally:
                 self._is_draining = False
@@ -242,9 +252,9 @@ class Daemon(Host):
             session = next(entry.session for entry in self._orders.queued.entries if entry.id == self._run_id)
             await self._orders.resume(session)
         except StandError as error:
-            self._tell(NOT_RESUMED, str(error), run=self._run_id)
+            self._publish(NOT_RESUMED, str(error), run=self._run_id)
             return
-        self._tell(RECORDING_RESTARTED, session=session)
+        self._publish(RECORDING_RESTARTED, session=session)
         self.wake()
 
     async def _run_one(self, entry: QueueEntry, notes: RunNotes) -> Path:
@@ -258,32 +268,32 @@ class Daemon(Host):
         def begun() -> None:
             nonlocal has_begun
             has_begun = True
-            self._beside(self._hand_over())
+            self._start_task(self._hand_over())
 
         def follow(item: Item) -> None:
             if has_begun and isinstance(item, Event) and item.kind == RUN_END and not self._orders.leaving:
-                self._beside(self._record_behind())
+                self._start_task(self._record_after_run())
 
-        self.has_guest = True
+        self.has_admitted_run = True
         self._status.tell(f"run {entry.id} ({entry.recipe})")
         self._hub.subscribe(follow)
         try:
-            await cancelled(list(self.hands))
+            await cancel_all(list(self.manual_tasks))
             await self._orders.read()
-            if self._assembly.stand.chamber.permits.granted:
+            if self._assembly.stand.chamber.permits.is_granted:
                 await self._assembly.stand.chamber.stop()
             return await self._perform(entry, notes, begun)
         except StandError as error:
             if not has_begun and not isinstance(error, Interrupted):
-                self._tell(RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
+                self._publish(RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
             raise
         finally:
             self._hub.unsubscribe(follow)
             if not self._orders.leaving:
-                await self._record_day()
-            self.has_guest = False
+                await self._record_idle()
+            self.has_admitted_run = False
             self.note()
-            self._status.tell(self.by_hand.doing)
+            self._status.tell(self.manual_control.doing)
 
     async def _perform(self, entry: QueueEntry, notes: RunNotes, begun: Callable[[], None]) -> Path:
         """Run the entry on the open stand, or resume it in the session it has; `begun` when its recording goes on
@@ -293,28 +303,28 @@ class Daemon(Host):
         session = orders.directory / entry.session if entry.session else None
         if session is not None and await orders.repair.call(is_complete, session):
             return session  # killed between its end and the note of it
-        order = await orders.reading.call(orders.order_of, entry)
+        order = await orders.reading.call(orders.get_order, entry)
         before = None if session is None else await self._interruption(session, order.config)
         watch = StepWatch(frozenset() if before is None else before.kept.done, notes.step_done)
 
         async def recorded(folder: Path) -> None:
             await notes.begun(folder)
             begun()
-            if session is None and (said := said_of(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
+            if session is None and (text := make_note(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
                 try:
-                    await keep(said, folder, orders.notes, hub, clock)
+                    await save_note(text, folder, orders.notes, hub, clock)
                 except SessionError as error:
-                    self._say(f"warning: {error}")
+                    self._publish_line(f"warning: {error}")
 
         def follow(hub: Hub) -> None:
             hub.subscribe(watch)
 
         plan = tuple(order.recipe.plan())
-        await asyncio.to_thread(load_for, plan)
+        await asyncio.to_thread(preload_for, plan)
         job = Job(order, orders.directory, None, follow, recorded, before)
         try:
             async with Stop(has_signals=False) as orders.stop:
-                done = await run_in(self.open_stand, job, orders.stop)
+                done = await run_on_stand(self.open_stand, job, orders.stop)
         except Interrupted as error:
             if orders.leaving:
                 raise
@@ -325,9 +335,9 @@ class Daemon(Host):
             orders.stop = None
             hub.unsubscribe(watch)
         try:
-            await orders.repair.call(learn, orders.directory, order.config)
+            await orders.repair.call(learn_durations, orders.directory, order.config)
         except SessionError as error:
-            self._say(f"warning: what this run has taught of durations is not kept: {error}")
+            self._publish_line(f"warning: what this run has taught of durations is not kept: {error}")
         if self._recorded_whole is not None and any(isinstance(planned.step, Capture) for planned in plan):
             self._recorded_whole(done)
         return done
@@ -336,22 +346,22 @@ class Daemon(Host):
         """What is left of its run; Halt when it cannot be resumed. What has to be written for that is written by the
         disk's process."""
         try:
-            salvaged = await self._orders.repair.call(repaired, session)
+            salvaged = await self._orders.repair.call(repair_session, session)
         except SessionError as error:
             raise Halt(str(error)) from error
-        before = await self._orders.reading.call(partial(interruption_of, session, config, reset=True))
+        before = await self._orders.reading.call(partial(load_queued_interruption, session, config, reset=True))
         return replace(before, salvaged=(*salvaged, *before.salvaged))
 
-    async def _record_day(self) -> None:
+    async def _record_idle(self) -> None:
         """Heat depends on the record between runs while no run records; a disk that refuses it is an event, and
         there is no heat by hand."""
         self._recorded_ns = self._clock.now_ns()
         try:
-            self.open_stand.recorder = await self.record.current()
+            self.open_stand.recorder = await self.record.get_current()
         except (SessionError, OSError) as error:
             self.open_stand.recorder = None
             self._assembly.stand.safety.demand()
-            self._tell(IDLE_LOG_NOT_RECORDED, str(error))
+            self._publish(IDLE_LOG_NOT_RECORDED, str(error))
 
     async def _hand_over(self) -> None:
         """The run records, and its session is known."""
@@ -359,35 +369,35 @@ class Daemon(Host):
         with suppress(SessionError):
             await self._orders.read()
 
-    async def _record_behind(self) -> None:
-        """The record goes on while the run that has ended is still completed; `_record_day` says when it cannot."""
+    async def _record_after_run(self) -> None:
+        """The record goes on while the run that has ended is still completed; `_record_idle` says when it cannot."""
         with suppress(SessionError, OSError):
-            await self.record.current()
+            await self.record.get_current()
 
     async def _end_record(self) -> None:
         try:
             await self.record.end(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
-            self._tell(IDLE_LOG_NOT_ENDED, str(error))
+            self._publish(IDLE_LOG_NOT_ENDED, str(error))
 
-    async def _look_after(self) -> None:
+    async def _supervise(self) -> None:
         """Midnight, a record that has ended by itself, what is kept for the next start, and what systemd shows."""
         kept_ns = self._clock.now_ns()
         while True:
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_LOOK_S))
-            may_begin = not (self.has_guest or self._orders.leaving)
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(_LOOK_S))
+            may_begin = not (self.has_admitted_run or self._orders.leaving)
             if may_begin:
-                self._status.tell(self.by_hand.doing)
+                self._status.tell(self.manual_control.doing)
             # Its disk process holds the queue's lock and what the compressor did; a new one would have to take both
             # while calls still wait for the old one. The service starts the daemon again.
             if may_begin and self.open_stand.disk is not None and (ended := self.open_stand.disk.ended):
                 raise SessionError(f"{ended}; neither queue nor what the compressor did can be kept without it")
             if may_begin and self._is_midnight():
-                await self._turn_day()
+                await self._start_new_day()
             if may_begin and self._needs_record():
-                self.open_stand.unrecorded()
+                self.open_stand.end_recording()
                 await self._end_record()
-                await self._record_day()
+                await self._record_idle()
             if self._clock.now_ns() - kept_ns >= _KEEP_EVERY_S * NS_PER_S:
                 kept_ns = self._clock.now_ns()
                 self.note()
@@ -406,20 +416,20 @@ class Daemon(Host):
         is_of_yesterday = recorder is not None and not recorder.writer_ended and not self.record.is_of_today()
         return is_of_yesterday and waited_ns >= _KEEP_EVERY_S * NS_PER_S
 
-    async def _turn_day(self) -> None:
+    async def _start_new_day(self) -> None:
         """Today's record takes over from yesterday's in one moment: heat by hand is recorded throughout."""
         self._turned_ns = self._clock.now_ns()
         try:
             recorder = await self.record.begin()
         except (SessionError, OSError) as error:
-            self._tell(IDLE_LOG_NOT_ENDED, f"today's record is not begun, yesterday's goes on: {error}")
+            self._publish(IDLE_LOG_NOT_ENDED, f"today's record is not begun, yesterday's goes on: {error}")
             return
         if self.open_stand.guest is None:
             self.open_stand.recorder = recorder
         try:
             await self.record.complete(FINISH_WITHIN_S)
         except (SessionError, OSError) as error:
-            self._tell(IDLE_LOG_NOT_ENDED, str(error))
+            self._publish(IDLE_LOG_NOT_ENDED, str(error))
 
     async def _adopt_camera(self) -> None:
         """A camera that is found powered is opened; one that is off stays off until somebody wants it."""
@@ -430,22 +440,22 @@ class Daemon(Host):
         try:
             await stand.imaging.supply.switch_on()
         except (DeviceError, StandTripped) as error:
-            self._tell(CAMERA_NOT_OPENED, str(error))
+            self._publish(CAMERA_NOT_OPENED, str(error))
 
-    async def _feed(self) -> None:
+    async def _feed_watchdog(self) -> None:
         """Feed the watchdog while guard and loop are on time: a disk that hangs is no reason to be killed."""
         limit_s = systemd.watchdog_s()
         every_s = _KEEP_EVERY_S if limit_s is None else limit_s / 3
         while True:
             if limit_s is not None and self.open_stand.guard.is_on_time:
-                systemd.tell(systemd.FED)
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(every_s))
+                systemd.notify_systemd(systemd.FED)
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(every_s))
 
     async def _reset_queue(self) -> None:
         try:
             await self._orders.reset()
         except SessionError as error:
-            self._tell(QUEUE_STILL_HALTED, str(error))
+            self._publish(QUEUE_STILL_HALTED, str(error))
         self.wake()
 
     def check_heat(self) -> None:
@@ -456,7 +466,7 @@ class Daemon(Host):
         if not self.open_stand.guard.may_permit():
             raise Conflict("the guard does not permit heat now: it waits for fresh readings, or holds the stand")
 
-    def _beside(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
+    def _start_task(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
         self._others.add(task)
         task.add_done_callback(self._others.discard)
@@ -467,5 +477,5 @@ class Daemon(Host):
         if isinstance(item, Event) and item.kind.startswith(GUARD):
             self.note()
 
-    def _say(self, line: str) -> None:
-        self._tell(QUEUE, line)
+    def _publish_line(self, line: str) -> None:
+        self._publish(QUEUE, line)

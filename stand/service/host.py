@@ -11,12 +11,12 @@ from pydantic import JsonValue
 
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import BY_HAND_FAILED, EventKind
-from thermostand.foundation.tasks import failure_text
-from thermostand.stand.running.guest import Guest
+from thermostand.foundation.tasks import describe_failure
 from thermostand.stand.running.opening.open_stand import OpenStand
-from thermostand.stand.service.by_hand import ByHand
-from thermostand.stand.service.orders import Orders
-from thermostand.stand.serving.desk import Conflict, DeviceState, HeatByHand, QueuedRun
+from thermostand.stand.running.run import Run
+from thermostand.stand.service.manual_control import ManualControl
+from thermostand.stand.service.run_queue import RunQueue
+from thermostand.stand.serving.api_models import Conflict, DeviceState, HeatByHand, QueuedRun
 
 _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer goes on
 
@@ -24,19 +24,19 @@ _BY_HAND_S = 1.0  # so long an order by hand is waited for; what takes longer go
 class Host:
     """An open stand with its one run, which is the whole queue. orders: of a daemon's queue, None without one."""
 
-    def __init__(self, open_stand: OpenStand, orders: Orders | None = None) -> None:
+    def __init__(self, open_stand: OpenStand, orders: RunQueue | None = None) -> None:
         self.open_stand = open_stand
         self.orders = orders
-        self.by_hand = ByHand(open_stand.assembly, self.check_heat)
-        self.hands: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
+        self.manual_control = ManualControl(open_stand.assembly, self.check_heat)
+        self.manual_tasks: dict[asyncio.Task[object], str] = {}  # orders by hand under way, and the device of each
         self._assembly = open_stand.assembly
         self._hub, self._clock = self._assembly.hub, self._assembly.clock
         self._began_ns = self._clock.now_ns()
 
     @property
-    def guest(self) -> Guest | None:
+    def guest(self) -> Run | None:
         """The run that has the stand."""
-        return cast("Guest | None", self.open_stand.guest)
+        return cast("Run | None", self.open_stand.guest)
 
     @property
     def has_run(self) -> bool:
@@ -51,9 +51,9 @@ class Host:
     @property
     def busy(self) -> tuple[str, ...]:
         """The devices that carry out an order: of a run, or by hand."""
-        return tuple(dict.fromkeys((*self._assembly.stand.motions.names, *self.hands.values())))
+        return tuple(dict.fromkeys((*self._assembly.stand.motions.names, *self.manual_tasks.values())))
 
-    def seen(self) -> dict[str, object]:
+    def get_state_fields(self) -> dict[str, object]:
         """The fields of the state that are known of whoever has the stand open."""
         ordered, by_hand = self._assembly.stand.chamber.ordered, None
         if ordered is not None and not self.has_run:  # as it was ordered: the regulator may not answer
@@ -78,9 +78,9 @@ class Host:
 
     def devices(self) -> tuple[DeviceState, ...]:
         """What is there, and what it takes by hand now."""
-        return self.by_hand.devices(self.refused_by_hand())
+        return self.manual_control.devices(self.explain_manual_refusal())
 
-    def refused_by_hand(self) -> str:
+    def explain_manual_refusal(self) -> str:
         """Why no device takes an order now, "" when they do."""
         if self.has_run:
             return "a run has the stand; pause does not change that, STOP ends the run"
@@ -89,17 +89,17 @@ class Host:
         reasons = self._assembly.stand.gate.reasons
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 
-    async def do_by_hand(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
+    async def run_manual_order(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
         """What came of it within a moment, as a sentence; Conflict when that is nothing good, or it is refused."""
-        if refused := self.refused_by_hand():
+        if refused := self.explain_manual_refusal():
             raise Conflict(refused)
         what = f"{name} {verb}"
-        hand = asyncio.ensure_future(self.by_hand.work(name, verb, arguments))
-        self.hands[hand] = name
-        hand.add_done_callback(self.hands.pop)
+        hand = asyncio.ensure_future(self.manual_control.work(name, verb, arguments))
+        self.manual_tasks[hand] = name
+        hand.add_done_callback(self.manual_tasks.pop)
         done, _ = await asyncio.wait([hand], timeout=_BY_HAND_S)
         if not done:
-            hand.add_done_callback(lambda ended: self._tell_failure(what, ended))
+            hand.add_done_callback(lambda ended: self._publish_failure(what, ended))
             return f"{what}: under way"
         if hand.cancelled():
             raise Conflict(f"{what}: stopped")
@@ -116,7 +116,7 @@ class Host:
 
     def stop(self) -> None:
         """The stand is made safe at once; a run that has it ends."""
-        for hand in self.hands:
+        for hand in self.manual_tasks:
             hand.cancel()
         if self.guest is None:
             self._assembly.stand.safety.demand()
@@ -132,9 +132,9 @@ class Host:
     def reset_queue(self) -> None:
         """A queue that was halted goes on."""
 
-    def _tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:
-        self._hub.publish(kind.at(self._clock.now_ns(), said, **data))
+    def _publish(self, kind: EventKind, text: str = "", /, **data: object) -> None:
+        self._hub.publish(kind.at(self._clock.now_ns(), text, **data))
 
-    def _tell_failure(self, what: str, ended: asyncio.Future[object]) -> None:
+    def _publish_failure(self, what: str, ended: asyncio.Future[object]) -> None:
         if not ended.cancelled() and (error := ended.exception()) is not None:
-            self._tell(BY_HAND_FAILED, failure_text(error), what=what)
+            self._publish(BY_HAND_FAILED, describe_failure(error), what=what)

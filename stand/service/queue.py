@@ -12,32 +12,32 @@ from typing import TYPE_CHECKING
 
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.files import make_folder
-from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, changing, read_queue
+from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, change_queue, read_queue
 
 if TYPE_CHECKING:
     from thermostand.stand.running.order import Order
 
 
-def order_of(entry: QueueEntry) -> Order:
+def make_order(entry: QueueEntry) -> Order:
     """What an entry asks for; ConfigError when this version of the program refuses it."""
     # The process that touches the disk for a daemon loads this module, and needs none of that.
-    from thermostand.stand.estimating.estimate import price
-    from thermostand.stand.running.order import parse_order, with_register_maps
+    from thermostand.stand.estimating.estimate import price_plan
+    from thermostand.stand.running.order import load_register_maps, parse_order
 
     texts = {"config.yaml": entry.config_text, "recipe.yaml": entry.recipe_text, "target.yaml": entry.target_text}
     names = {"config.yaml": entry.config, "recipe.yaml": entry.recipe, "target.yaml": "its target"}
     order = parse_order(texts, {key: f"run {entry.id} of the queue: {name}" for key, name in names.items()})
-    price(order.recipe.plan(), order.config)
-    return with_register_maps(order)
+    price_plan(order.recipe.plan(), order.config)
+    return load_register_maps(order)
 
 
-def queued(directory: Path) -> Queue:
+def load_queue(directory: Path) -> Queue:
     """The queue as it is now."""
     return read_queue(directory)
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RunOrigin:
     """Who asked for a run, and how: see queue_file.QueueEntry."""
 
     key: str = ""
@@ -47,7 +47,7 @@ class Asked:
     tags: tuple[str, ...] = ()
 
 
-def entry_of(order: Order, config: str, now_ns: int, asked: Asked = Asked()) -> QueueEntry:
+def make_entry(order: Order, config: str, now_ns: int, asked: RunOrigin = RunOrigin()) -> QueueEntry:
     """What is to be queued; `config` is the name of its configuration, for messages. Its number is given later."""
     return QueueEntry(
         id=1,
@@ -66,7 +66,7 @@ def append(directory: Path, entry: QueueEntry) -> QueueEntry:
     """Queue it behind all others, with a number of its own. With the key of an earlier run: that one. SessionError
     when the request of that key was another."""
     make_folder(directory)
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         earlier = next((each for each in draft.queue.entries if entry.key and each.key == entry.key), None)
         if earlier is not None:
             if earlier.request != entry.request:
@@ -81,7 +81,7 @@ def move(directory: Path, number: int, position: int) -> None:
     """Make a run the `position`-th of those still to be done, 1 is the next; behind the last is the last."""
     if position < 1:
         raise SessionError(f"position {position}: the next run has position 1")
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         entry = draft.entry(number)
         if not entry.is_open:
             raise SessionError(f"run {number} is {entry.state}; only a run that is still to be done can be moved")
@@ -92,7 +92,7 @@ def move(directory: Path, number: int, position: int) -> None:
 
 def remove(directory: Path, number: int) -> QueueEntry:
     """Take a run out of the queue, in any state but running; its session stays. SessionError when it is running."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         entry = draft.entry(number)
         if entry.state is QueueState.RUNNING:
             raise SessionError(f"run {number} is running; `stand stop` ends it")
@@ -105,7 +105,7 @@ def take(directory: Path, now_ns: int) -> QueueEntry | None:
 
     StandTripped when the queue was halted and no operator has reset it.
     """
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         queue = draft.queue
         if queue.halted:
             remedy = "remove the cause, then `stand reset`"
@@ -127,13 +127,13 @@ def take(directory: Path, now_ns: int) -> QueueEntry | None:
 
 def note_session(directory: Path, number: int, session: Path) -> None:
     """The run has a session now; when it is interrupted it is resumed there."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         draft.put(draft.entry(number).model_copy(update={"session": session.name}))
 
 
 def note_step(directory: Path, number: int) -> None:
     """The run under way has finished a step that it had not finished before."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         draft.put(draft.entry(number).model_copy(update={"fruitless_starts": 0}))
 
 
@@ -141,7 +141,7 @@ def finish(
     directory: Path, number: int, state: QueueState, now_ns: int, reason: str = "", *, halt: bool = False
 ) -> None:
     """The run under way has ended; with `halt` nothing is begun before an operator says so."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         changes = {"state": state, "ended_ns": now_ns, "reason": reason}
         if state is QueueState.INTERRUPTED:
             changes["fruitless_starts"] = 0  # by an operator, who may do so as often as he likes
@@ -152,14 +152,14 @@ def finish(
 
 def halt(directory: Path, reason: str) -> None:
     """Nothing is begun before an operator says so."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         draft.set(halted=draft.queue.halted or reason)
 
 
-def put_first(directory: Path, entry: QueueEntry, session: str) -> QueueEntry:
+def prepend(directory: Path, entry: QueueEntry, session: str) -> QueueEntry:
     """Resume the run of that session next: an entry that has it is interrupted again, else `entry` is. What halted the
     queue is reset: an operator has asked for this."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         found = next((each for each in reversed(draft.queue.entries) if each.session == session), None)
         known: dict[str, object] = {"id": draft.queue.next_id, "began_ns": entry.added_ns}
         if found is not None:
@@ -173,5 +173,5 @@ def put_first(directory: Path, entry: QueueEntry, session: str) -> QueueEntry:
 
 def reset(directory: Path) -> None:
     """An operator resets a halted queue."""
-    with changing(directory) as draft:
+    with change_queue(directory) as draft:
         draft.set(halted="")

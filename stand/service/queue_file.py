@@ -18,9 +18,9 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.documents import Document
-from thermostand.foundation.errors import NotThere, SessionError
+from thermostand.foundation.errors import NotFound, SessionError
 from thermostand.foundation.files import replace_file
 from thermostand.foundation.sealed import seal, unseal
 
@@ -47,7 +47,7 @@ class QueueState(StrEnum):
     INTERRUPTED = "interrupted"
 
 
-def _folder_name(name: str) -> str:
+def _check_folder_name(name: str) -> str:
     """A session's folder must be in the recording directory."""
     if name in (".", "..") or "/" in name or "\\" in name or not name.isprintable() or len(name.encode()) > 255:
         raise ValueError("expected the name of a folder in the recording directory")
@@ -74,7 +74,7 @@ class QueueEntry(Document):
     added_ns: int
     began_ns: int | None = None
     ended_ns: int | None = None
-    session: Annotated[str, AfterValidator(_folder_name)] = ""
+    session: Annotated[str, AfterValidator(_check_folder_name)] = ""
     reason: str = ""
     fruitless_starts: int = Field(default=0, ge=0)
     key: str = ""
@@ -104,7 +104,7 @@ class Queue(Document):
     entries: tuple[QueueEntry, ...] = ()
 
 
-class Draft:
+class QueueDraft:
     """A queue that is being changed; `queue` is written when the block ends well."""
 
     def __init__(self, queue: Queue) -> None:
@@ -130,62 +130,62 @@ def read_queue(directory: Path) -> Queue:
     """The queue of a recording directory, an empty one when there is none; SessionError when it cannot be read."""
     if not any((directory / name).exists() for name in (QUEUE_NAME, LAST_NAME)):
         return Queue()
-    with _locked(directory):
-        return _settled(directory, _load(directory))
+    with _lock(directory):
+        return _settle(directory, _load(directory))
 
 
 @contextmanager
-def changing(directory: Path) -> Generator[Draft]:
+def change_queue(directory: Path) -> Generator[QueueDraft]:
     """Change the queue, under its lock: all of the change is on the disk at the end, or nothing."""
-    with _locked(directory):
+    with _lock(directory):
         before = _load(directory)
-        draft = Draft(_settled(directory, before))
+        draft = QueueDraft(_settle(directory, before))
         yield draft
         if draft.queue != before:
-            _store(directory, _pruned(draft.queue))
+            _store(directory, _prune(draft.queue))
 
 
 @contextmanager
-def working(directory: Path) -> Generator[None]:
+def lock_worker(directory: Path) -> Generator[None]:
     """Run this queue alone; SessionError when another process does. What the last one had under way is
     interrupted from now on."""
-    with _opened(directory / _WORKER_NAME) as worker:
-        with _locked(directory):  # a check whether the queue is being run takes the same lock
+    with _open(directory / _WORKER_NAME) as worker:
+        with _lock(directory):  # a check whether the queue is being run takes the same lock
             if not _try_lock(worker):
                 raise SessionError(f"{directory}: another process is running its queue already")
             found = _load(directory)
-            if _running(found):
-                _store(directory, _interrupted(found))
+            if _has_running(found):
+                _store(directory, _interrupt(found))
         yield
 
 
-def worked_on(directory: Path) -> ExitStack:
+def start_working(directory: Path) -> ExitStack:
     """`working` until what is returned is closed, or its process ends."""
     stack = ExitStack()
-    stack.enter_context(working(directory))
+    stack.enter_context(lock_worker(directory))
     return stack
 
 
-def _pruned(queue: Queue) -> Queue:
+def _prune(queue: Queue) -> Queue:
     """Without all but the latest of the runs that have ended."""
     ended = [entry.id for entry in queue.entries if not entry.is_open and entry.state is not QueueState.RUNNING]
     old = frozenset(ended[:-KEPT_ENDED])
     return queue.model_copy(update={"entries": tuple(entry for entry in queue.entries if entry.id not in old)})
 
 
-def _settled(directory: Path, queue: Queue) -> Queue:
+def _settle(directory: Path, queue: Queue) -> Queue:
     """A run marked as running while no process runs the queue was interrupted."""
-    if not _running(queue):
+    if not _has_running(queue):
         return queue
-    with _opened(directory / _WORKER_NAME) as worker:
-        return _interrupted(queue) if _try_lock(worker) else queue
+    with _open(directory / _WORKER_NAME) as worker:
+        return _interrupt(queue) if _try_lock(worker) else queue
 
 
-def _running(queue: Queue) -> bool:
+def _has_running(queue: Queue) -> bool:
     return any(entry.state is QueueState.RUNNING for entry in queue.entries)
 
 
-def _interrupted(queue: Queue) -> Queue:
+def _interrupt(queue: Queue) -> Queue:
     cut = {"state": QueueState.INTERRUPTED, "reason": "its daemon was killed"}
     entries = (entry.model_copy(update=cut) if entry.state is QueueState.RUNNING else entry for entry in queue.entries)
     return queue.model_copy(update={"entries": tuple(entries)})
@@ -207,14 +207,14 @@ def _load(directory: Path) -> Queue:
     except OSError as error:
         raise SessionError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise SessionError(f"{path}: is damaged ({_first_fault(error)}); {_REMEDY}") from error
+        raise SessionError(f"{path}: is damaged ({_describe_first_fault(error)}); {_REMEDY}") from error
 
 
-def _first_fault(error: ValueError) -> str:
+def _describe_first_fault(error: ValueError) -> str:
     if not isinstance(error, ValidationError):
         return str(error)
     fault = error.errors()[0]
-    where = path_text(fault["loc"])
+    where = format_path(fault["loc"])
     return f"{where}: {fault['msg']}" if where else fault["msg"]
 
 
@@ -232,18 +232,18 @@ def _store(directory: Path, queue: Queue) -> None:
 
 
 @contextmanager
-def _locked(directory: Path) -> Generator[None]:
-    with _opened(directory / _LOCK_NAME) as lock:
+def _lock(directory: Path) -> Generator[None]:
+    with _open(directory / _LOCK_NAME) as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
 
 @contextmanager
-def _opened(path: Path) -> Generator[int]:
+def _open(path: Path) -> Generator[int]:
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except FileNotFoundError as error:
-        raise NotThere(f"{path.parent}: no such folder; `stand serve` makes it") from error
+        raise NotFound(f"{path.parent}: no such folder; `stand serve` makes it") from error
     except OSError as error:
         raise SessionError(f"{path.parent}: its queue cannot be locked ({error.strerror})") from error
     try:

@@ -25,7 +25,7 @@ import yaml
 from thermostand.drivers.devices.motion.flap import FlapSettings
 from thermostand.drivers.devices.protocols import Camera
 from thermostand.drivers.settings import CameraSettings, OnBus
-from thermostand.foundation.clock import Clock, VirtualClock, WallClock, seconds_ns
+from thermostand.foundation.clock import Clock, VirtualClock, WallClock, to_ns
 from thermostand.foundation.errors import ConfigError, Interrupted, Refused, SessionError, StandError, StandTripped
 from thermostand.foundation.events import (
     JOURNAL_DAMAGED,
@@ -36,40 +36,40 @@ from thermostand.foundation.events import (
     STAND_DIFFERS,
 )
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.instants import utc_text
+from thermostand.foundation.instants import format_utc
 from thermostand.foundation.items import Event, Item
-from thermostand.foundation.progress import late_progress
+from thermostand.foundation.progress import show_late_progress
 from thermostand.foundation.readings import Quality
-from thermostand.foundation.repeats import RepeatLimit
-from thermostand.foundation.tasks import cancelled, cause_of, failure_text
+from thermostand.foundation.repeat_limit import RepeatLimit
+from thermostand.foundation.tasks import cancel_all, describe_failure, find_cause
 from thermostand.recording.format.manifest import SessionInfo
-from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_line, salvage_unfinished
+from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, format_salvaged, salvage_unfinished
 from thermostand.recording.writing.disk import REPAIR_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
 from thermostand.stand.assembly import Assembly, assemble
-from thermostand.stand.config.safe_ranges import accepted_text
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.running.guest import Guest, Job, Work
-from thermostand.stand.running.opening.claim import claimed, latch_file
+from thermostand.stand.config.safe_ranges import describe_accepted
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.opening.clock_watch import ClockWatch
-from thermostand.stand.running.opening.open_stand import OpenStand, Time, opened
+from thermostand.stand.running.opening.open_stand import OpenStand, Time, open_assembly
+from thermostand.stand.running.opening.stand_lock import find_latch_file, lock_stand
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.opening.writer_restarts import WriterRestarts
-from thermostand.stand.running.order import Order, with_register_maps
-from thermostand.stand.running.resume import Interruption, interruption, is_of_virtual_time
+from thermostand.stand.running.order import Order, load_register_maps
+from thermostand.stand.running.resume import Interruption, is_of_virtual_time, load_interruption
+from thermostand.stand.running.run import Job, Run, Work
 from thermostand.stand.running.session_files import (
-    camera_serials,
-    info_of,
-    recorder_of,
-    session_directory,
-    tell_identities,
+    choose_session_directory,
+    list_camera_serials,
+    make_run_recorder,
+    make_session_info,
+    publish_identities,
 )
 from thermostand.stand.service.host import Host
 from thermostand.stand.service.stand_service import StandService
-from thermostand.stand.serving.alerts import alerting
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.alerts import send_alerts
+from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
+from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory, relocate
 
 # A real stand's file as a rehearsal: the simulated laboratory answers in the place of its devices.
 
@@ -77,7 +77,7 @@ _FOUND_BY = {"address", "width_px", "height_px"}  # of a camera: where it is, an
 _HEAD = "# A rehearsal of this stand's file: the simulated laboratory in the place of its devices.\n"
 
 
-def rehearsed(order: Order) -> Order:
+def make_rehearsal(order: Order) -> Order:
     """The order on the simulated laboratory. Kept: limits, thermometers, axes, contacts, what the guard allows, what
     the cameras are asked for, and the recipe. Replaced: addresses, and the units on the bus by those that the
     laboratory has; nobody is notified. An order of a simulated stand stays as it is. ConfigError for an axis that it
@@ -85,9 +85,9 @@ def rehearsed(order: Order) -> Order:
     config = order.config
     if config.simulation is not None:
         return order
-    there = load_config(packaged("", "simulated"))
-    if strange := sorted(config.axes.keys() - there.axes.keys()):
-        known = ", ".join(there.axes)
+    remote = load_config(find_packaged("", "simulated"))
+    if strange := sorted(config.axes.keys() - remote.axes.keys()):
+        known = ", ".join(remote.axes)
         raise ConfigError(f"{config.name}: the simulated laboratory has no axis {strange[0]}, only {known}")
     ports = itertools.count(_FIRST_PORT)
     changed: dict[str, Any] = {}
@@ -95,37 +95,37 @@ def rehearsed(order: Order) -> Order:
         if isinstance(settings, OnBus):
             changed[name] = settings.model_copy(update={"registers": kind.simulated_map})
         elif kind.section == "axes":
-            changed[name] = settings.model_copy(update={"address": there.axes[name].address})
+            changed[name] = settings.model_copy(update={"address": remote.axes[name].address})
         elif kind.section == "cameras":
-            changed[name] = _camera(settings, there.cameras["camera"])
+            changed[name] = _rehearse_camera(settings, remote.cameras["camera"])
         elif kind.section == "flap":
-            changed[name] = _flap(settings, there.flap)
+            changed[name] = _rehearse_flap(settings, remote.flap)
         elif hasattr(settings, "address"):
             changed[name] = settings.model_copy(update={"address": f"tcp:127.0.0.1:{next(ports)}"})
-    update: dict[str, Any] = config.sections_with(changed) | {
-        "bus": there.bus,
+    update: dict[str, Any] = config.replace_settings(changed) | {
+        "bus": remote.bus,
         "compressor": config.compressor.model_copy(update={"state_file": None}),
-        "alerts": there.alerts,
-        "simulation": there.simulation,
+        "alerts": remote.alerts,
+        "simulation": remote.simulation,
     }
     rehearsal = StandConfig.model_validate(config.model_copy(update=update).model_dump(mode="json", exclude_none=True))
     text = _HEAD + yaml.safe_dump(rehearsal.model_dump(mode="json", exclude_none=True), sort_keys=False)
-    return with_register_maps(replace(order, config=rehearsal, config_text=text))
+    return load_register_maps(replace(order, config=rehearsal, config_text=text))
 
 
 _FIRST_PORT = 15023  # of what has a line of its own
 
 
-def _flap(own: FlapSettings, there: FlapSettings | None) -> FlapSettings:
+def _rehearse_flap(own: FlapSettings, remote: FlapSettings | None) -> FlapSettings:
     return own.model_copy(
-        update={name: getattr(there, name) for name in ("backend", "backend_address")} if there is not None else {}
+        update={name: getattr(remote, name) for name in ("backend", "backend_address")} if remote is not None else {}
     )
 
 
-def _camera(own: CameraSettings, there: CameraSettings) -> CameraSettings:
+def _rehearse_camera(own: CameraSettings, remote: CameraSettings) -> CameraSettings:
     """The simulated camera, asked for what this stand asks of its own."""
     names = CameraSettings.model_fields.keys() - _FOUND_BY
-    return there.model_copy(update={name: getattr(own, name) for name in names})
+    return remote.model_copy(update={name: getattr(own, name) for name in names})
 
 
 # A virtual run and its simulator on one CPU, which no other virtual run of this machine has taken.
@@ -134,7 +134,7 @@ _CPU_FOLDER = "/sys/devices/system/cpu/cpu{}"
 
 
 @contextmanager
-def one_cpu() -> Generator[None]:
+def pin_to_one_cpu() -> Generator[None]:
     """Inside, this process and its children (the simulator) run on one of the CPUs they may use.
 
     In virtual time daemon and simulator take turns, a dozen in each polled second, and never work at once. On one CPU a
@@ -142,17 +142,17 @@ def one_cpu() -> Generator[None]:
     take different CPUs as long as there are any left.
     """
     usable = os.sched_getaffinity(0)
-    cpu, folder = _take(sorted(usable))
-    _use({cpu})
+    cpu, folder = _choose_cpu(sorted(usable))
+    _pin_threads({cpu})
     try:
         yield
     finally:
-        _use(usable)
+        _pin_threads(usable)
         if folder is not None:
             os.close(folder)
 
 
-def _take(cpus: Sequence[int]) -> tuple[int, int | None]:
+def _choose_cpu(cpus: Sequence[int]) -> tuple[int, int | None]:
     """The first of `cpus` that no other run has taken, and the descriptor that keeps it; when there is none, one by the
     process' number.
 
@@ -173,7 +173,7 @@ def _take(cpus: Sequence[int]) -> tuple[int, int | None]:
     return cpus[os.getpid() % len(cpus)], None
 
 
-def _use(cpus: set[int]) -> None:
+def _pin_threads(cpus: set[int]) -> None:
     """Every thread of this process: one that waits for work in a pool would start the simulator elsewhere."""
     for thread in os.listdir("/proc/self/task"):
         with suppress(ProcessLookupError):  # it has ended meanwhile
@@ -197,31 +197,31 @@ async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:
     for _ in range(_TRIES - 1):
         if reading.quality is not Quality.BAD:
             return
-        await clock.sleep_until(clock.now_ns() + seconds_ns(_PAUSE_S))
+        await clock.sleep_until(clock.now_ns() + to_ns(_PAUSE_S))
         (reading,) = await camera.read()
     if reading.quality is Quality.BAD:
-        place = await camera.temperature_place()
+        place = await camera.describe_temperature_place()
         keys = f"cameras.{camera.name}"
         remedy = f"correct {keys}.temperature in the configuration, or say {keys}.has_temperature: false there"
         where = f" ({place})" if place else ""
         raise Refused(camera.name, f"its temperature is BAD before the first step: {reading.reason}{where}; {remedy}")
 
 
-__all__ = ["Interrupted", "resume", "run_in", "run_real", "run_virtual"]
+__all__ = ["Interrupted", "resume", "run_on_stand", "run_real", "run_virtual"]
 
 
 # What answers the clients of a run, which records in this folder, while inside.
 Front = Callable[[StandService, Path], AbstractAsyncContextManager[object]]
 
 
-async def _nobody(_: Path) -> None:
+async def _ignore_session(_: Path) -> None:
     """Gets the session and does nothing."""
 
 
 @asynccontextmanager
-async def by_socket(service: StandService, session: Path) -> AsyncGenerator[None]:
+async def serve_by_socket(service: StandService, session: Path) -> AsyncGenerator[None]:
     """Clients of this machine and user alone: any number of virtual runs go side by side."""
-    async with serve(service, session, service.stand, Interface(session.parent), service.patience):
+    async with serve(service, session, service.stand, Interface(session.parent), service.shutdown_deadline):
         yield
 
 
@@ -230,8 +230,8 @@ async def run_virtual(
     out: Path,
     seed: int | None,
     watch: Callable[[Hub], None],
-    begun: Callable[[Path], Awaitable[None]] = _nobody,
-    front: Front = by_socket,
+    begun: Callable[[Path], Awaitable[None]] = _ignore_session,
+    front: Front = serve_by_socket,
 ) -> Path:
     """Run against a simulated laboratory of its own, in virtual time; returns the session's folder.
 
@@ -241,26 +241,26 @@ async def run_virtual(
     `begun` gets the folder as soon as a run that is killed could be resumed in it; `front` answers from then on.
     Raises Interrupted, StandTripped, SessionError when frames were lost, and what opening or a step raised.
     """
-    order = rehearsed(order)
+    order = make_rehearsal(order)
     simulation = order.config.simulation
     if simulation is None:
         raise ValueError("a rehearsal has a simulated laboratory")
-    return await _run_virtual(Job(order, out, seed, watch, begun), front, seconds_ns(simulation.start.timestamp()))
+    return await _run_virtual(Job(order, out, seed, watch, begun), front, to_ns(simulation.start.timestamp()))
 
 
 async def run_real(
     order: Order,
     out: Path,
     watch: Callable[[Hub], None],
-    begun: Callable[[Path], Awaitable[None]] = _nobody,
-    front: Front = by_socket,
+    begun: Callable[[Path], Awaitable[None]] = _ignore_session,
+    front: Front = serve_by_socket,
 ) -> Path:
     """Run on the host's clock, against the devices at the configured addresses; else as run_virtual."""
-    return await _kept_on(Job(order, out, None, watch, begun), front, WallClock())
+    return await _run_with_restarts(Job(order, out, None, watch, begun), front, WallClock())
 
 
 async def resume(
-    before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0, front: Front = by_socket
+    before: Interruption, watch: Callable[[Hub], None], downtime_s: float = 60.0, front: Front = serve_by_socket
 ) -> Path:
     """Resume an interrupted run, in the time it was run in, and add to its session; raises as run_virtual.
 
@@ -269,24 +269,24 @@ async def resume(
     the session continues at that instant, and the offset to UTC is recorded.
     """
     try:
-        job = Job(before.order, before.directory.parent, before.seed, watch, _nobody, before)
+        job = Job(before.order, before.directory.parent, before.seed, watch, _ignore_session, before)
         if is_of_virtual_time(before):
-            return await _run_virtual(job, front, before.last_ns + seconds_ns(downtime_s))
-        return await _kept_on(job, front, WallClock(before.last_ns + 1))
+            return await _run_virtual(job, front, before.last_ns + to_ns(downtime_s))
+        return await _run_with_restarts(job, front, WallClock(before.last_ns + 1))
     finally:
         before.release()
 
 
-async def _kept_on(job: Job, front: Front, clock: WallClock) -> Path:
+async def _run_with_restarts(job: Job, front: Front, clock: WallClock) -> Path:
     """Run on the host's clock. When the process that writes the session is killed, the stand is made safe and closed,
     and the run resumed with another one."""
     restarts, directory = WriterRestarts(), None if job.before is None else job.before.directory
-    told = job.begun
+    named = job.begun
 
     async def begun(folder: Path) -> None:
         nonlocal directory
         directory = folder
-        await told(folder)
+        await named(folder)
 
     job = replace(job, begun=begun)
     while True:
@@ -300,28 +300,28 @@ async def _kept_on(job: Job, front: Front, clock: WallClock) -> Path:
         finally:
             if job.before is not None:
                 job.before.release()
-        await asyncio.to_thread(latch_file(job.order.config).reset)
-        before = await asyncio.to_thread(partial(interruption, directory, job.order.config, reset=True))
+        await asyncio.to_thread(find_latch_file(job.order.config).reset)
+        before = await asyncio.to_thread(partial(load_interruption, directory, job.order.config, reset=True))
         order = replace(before.order, attended=job.order.attended)
         before = replace(before, order=order)
-        job, clock = replace(job, order=order, before=before, begun=_nobody), WallClock(before.last_ns + 1)
+        job, clock = replace(job, order=order, before=before, begun=_ignore_session), WallClock(before.last_ns + 1)
 
 
-async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
+async def run_on_stand(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
     """Run, or resume, on a stand that stays open behind it; returns the session's folder, and raises as run_virtual."""
-    hub, early = open_stand.assembly.hub, _Early()
+    hub, early = open_stand.assembly.hub, _EarlyEvents()
     hub.subscribe(early)
     try:
         job.watch(hub)
         await _announce(job, open_stand.assembly, open_stand.disk, has_own=True)
-        directory = _directory(job, open_stand.assembly.clock)
+        directory = _choose_directory(job, open_stand.assembly.clock)
         async with _memory_in_words(open_stand.assembly, directory), AsyncExitStack() as stack:
             disk = DiskProcess()
-            stack.push_async_callback(disk.ended_within, stop.patience)
-            stack.callback(open_stand.unrecorded)
-            stack.push_async_callback(stop.settled)
+            stack.push_async_callback(disk.end_within, stop.shutdown_deadline)
+            stack.callback(open_stand.end_recording)
+            stack.push_async_callback(stop.wait_until_aborted)
             stop.watch(open_stand.assembly.stand)
-            recorder = await _stay(job, directory, open_stand, early, stop, disk)
+            recorder = await _record_and_run(job, directory, open_stand, early, stop, disk)
             _check_outcome(directory, recorder, open_stand.assembly)
         return directory
     finally:
@@ -333,22 +333,22 @@ async def run_in(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
 
 async def _run_virtual(job: Job, front: Front, start_ns: int) -> Path:
     order = job.order
-    laboratory = laboratory_of(
+    laboratory = describe_laboratory(
         order.config, virtual=True, seed=job.seed, start_ns=start_ns, is_anywhere=not order.at_configured_addresses
     )
     async with Stop() as stop, AsyncExitStack() as stack:
-        stack.enter_context(one_cpu())
-        simulator = await _started(laboratory)
+        stack.enter_context(pin_to_one_cpu())
+        simulator = await _start_simulator(laboratory)
         stack.push_async_callback(asyncio.to_thread, simulator.stop)
         control = ControlSocket(simulator.addresses["control"])
         stack.push_async_callback(control.close)
         await control.open()
         clock = VirtualClock(start_ns, control.advance)
-        there = replace(job, order=replace(order, config=relocated(order.config, simulator.addresses)))
-        return await _run(there, front, clock, clock.run, stop)
+        remote = replace(job, order=replace(order, config=relocate(order.config, simulator.addresses)))
+        return await _run(remote, front, clock, clock.run, stop)
 
 
-async def _started(laboratory: Mapping[str, object]) -> Simulator:
+async def _start_simulator(laboratory: Mapping[str, object]) -> Simulator:
     """The simulator process; when the run is stopped meanwhile, it is ended again."""
     starting = asyncio.ensure_future(asyncio.to_thread(Simulator, laboratory))
     try:
@@ -361,22 +361,24 @@ async def _started(laboratory: Mapping[str, object]) -> Simulator:
 
 async def _run(job: Job, front: Front, clock: Clock, time: Time | None, stop: Stop) -> Path:
     """The whole run; one on a real stand has it for itself from before anything is opened, or does not touch it."""
-    directory = _directory(job, clock)
-    async with claimed(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
+    directory = _choose_directory(job, clock)
+    async with lock_stand(job.order.config, directory) if isinstance(clock, WallClock) else nullcontext():
         if isinstance(clock, WallClock):
             await asyncio.to_thread(_check_latch, job)
-        hub, early = Hub(RepeatLimit()), _Early()
+        hub, early = Hub(RepeatLimit()), _EarlyEvents()
         job.watch(hub)
         hub.subscribe(early)
         if isinstance(clock, WallClock):
             time = ClockWatch(hub, clock, 0 if job.before is None else job.before.utc_offset_ns).run
         assembly = assemble(job.order.config, hub, clock)
         await _announce(job, assembly)
-        alerts = alerting(assembly.config.name, assembly.config.alerts, hub, clock)
+        alerts = send_alerts(assembly.config.name, assembly.config.alerts, hub, clock)
         async with alerts, _memory_in_words(assembly, directory):
-            async with opened(assembly, time, stop, is_for_one=True) as open_stand:
-                answer = partial(_answer, open_stand, directory, front)
-                recorder = await _stay(job, directory, open_stand, early, stop, open_stand.disk, answer=answer)
+            async with open_assembly(assembly, time, stop, is_for_one=True) as open_stand:
+                answer = partial(_serve_clients, open_stand, directory, front)
+                recorder = await _record_and_run(
+                    job, directory, open_stand, early, stop, open_stand.disk, answer=answer
+                )
             _check_outcome(directory, recorder, assembly)
     return directory
 
@@ -384,36 +386,36 @@ async def _run(job: Job, front: Front, clock: Clock, time: Time | None, stop: St
 def _check_latch(job: Job) -> None:
     """StandTripped when the stand has tripped and nobody has reset it; a run that is resumed after its trip was
     reset resets it."""
-    latch = latch_file(job.order.config)
+    latch = find_latch_file(job.order.config)
     if job.before is not None and job.before.state.tripped:
         latch.reset()
     elif (fault := latch.read()) is not None:
-        since = f" at {utc_text(fault.since_ns)}" if fault.since_ns else ""
+        since = f" at {format_utc(fault.since_ns)}" if fault.since_ns else ""
         raise StandTripped(f"the stand has tripped{since}: {fault.text}; remove the cause, then `stand reset`")
 
 
-def _directory(job: Job, clock: Clock) -> Path:
+def _choose_directory(job: Job, clock: Clock) -> Path:
     """The session's folder."""
-    return job.before.directory if job.before is not None else session_directory(job.out, job.order, clock)
+    return job.before.directory if job.before is not None else choose_session_directory(job.out, job.order, clock)
 
 
 async def _announce(job: Job, assembly: Assembly, disk: DiskProcess | None = None, *, has_own: bool = False) -> None:
     """What the session has to say before anything moves; what earlier runs that were killed have left is completed.
     has_own: what is being recorded now is the stand's own record, which need not be announced."""
     hub, clock = assembly.hub, assembly.clock
-    for segment in await _salvaged(job, assembly.clock, disk):
+    for segment in await _salvage(job, assembly.clock, disk):
         if has_own and segment.reason == BEING_RECORDED:
             continue
-        hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
-    if accepted := job.order.config.accepted():
-        hub.publish(LIMITS_OVERRIDDEN.at(clock.now_ns(), accepted_text(accepted), **accepted))
+        hub.publish(SALVAGED.at(clock.now_ns(), format_salvaged(segment)))
+    if accepted := job.order.config.list_accepted():
+        hub.publish(LIMITS_OVERRIDDEN.at(clock.now_ns(), describe_accepted(accepted), **accepted))
     if job.before is not None and job.before.journal.damage:
         hub.publish(JOURNAL_DAMAGED.at(clock.now_ns(), job.before.journal.damage))
     for difference in () if job.before is None else job.before.differences:
         hub.publish(STAND_DIFFERS.at(clock.now_ns(), str(difference), **difference.data()))
 
 
-async def _salvaged(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[Salvaged, ...]:
+async def _salvage(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[Salvaged, ...]:
     """What earlier runs that were killed have left unfinished, finished before anything moves; where a stand is open,
     by the process that touches its disk."""
     if job.before is not None:
@@ -424,7 +426,7 @@ async def _salvaged(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[S
             return tuple(await repair.call(salvage_unfinished, job.out))
         finally:
             repair.close()
-    with late_progress("repair", 1.0) as report:
+    with show_late_progress("repair", 1.0) as report:
         return tuple(await asyncio.to_thread(salvage_unfinished, job.out, report))
 
 
@@ -434,18 +436,18 @@ async def _memory_in_words(assembly: Assembly, directory: Path) -> AsyncGenerato
     try:
         yield
     except Exception as raised:
-        if isinstance(error := cause_of(raised), MemoryError):
+        if isinstance(error := find_cause(raised), MemoryError):
             unsafe = "; ".join(assembly.stand.safety.unconfirmed)
-            said = f"{directory}: {failure_text(error)}{unsafe and f'; NOT SAFE: {unsafe}'}"
-            raise StandError(said) from raised
+            text = f"{directory}: {describe_failure(error)}{unsafe and f'; NOT SAFE: {unsafe}'}"
+            raise StandError(text) from raised
         raise
 
 
-async def _stay(
+async def _record_and_run(
     job: Job,
     directory: Path,
     open_stand: OpenStand,
-    early: _Early,
+    early: _EarlyEvents,
     stop: Stop,
     disk: DiskProcess | None,
     *,
@@ -454,17 +456,19 @@ async def _stay(
     """From the camera's start to the end of the recording."""
     is_camera_on = job.before is None or job.before.kept.set_up.camera_on
     async with AsyncExitStack() as stack:
-        tell_identities(open_stand.assembly, open_stand.assembly.hub.publish)
+        publish_identities(open_stand.assembly, open_stand.assembly.hub.publish)
         if is_camera_on:
-            await open_stand.or_safe(_with_camera(open_stand.assembly), stop)
-        recorder = await open_stand.or_safe(_recording(job, directory, open_stand.assembly, early, disk), stop)
+            await open_stand.run_or_make_safe(_power_camera(open_stand.assembly), stop)
+        recorder = await open_stand.run_or_make_safe(
+            _start_recorder(job, directory, open_stand.assembly, early, disk), stop
+        )
         recording = asyncio.create_task(recorder.run())
         stack.push_async_callback(_finish, recorder, recording, stop)
-        await Guest(job, open_stand, recorder, stop, answer).run(recording)
+        await Run(job, open_stand, recorder, stop, answer).run(recording)
     return recorder
 
 
-async def _answer(open_stand: OpenStand, directory: Path, front: Front) -> None:
+async def _serve_clients(open_stand: OpenStand, directory: Path, front: Front) -> None:
     """Answer clients of a run by itself until cancelled; it can do without any."""
     assembly = open_stand.assembly
     try:
@@ -475,33 +479,35 @@ async def _answer(open_stand: OpenStand, directory: Path, front: Front) -> None:
         await asyncio.Event().wait()
 
 
-async def _with_camera(assembly: Assembly) -> None:
+async def _power_camera(assembly: Assembly) -> None:
     """The camera is switched on before anything else may happen; one that is on and open stays so."""
     supply, cameras = assembly.stand.imaging.supply, assembly.devices.cameras.values()
     if cameras and not (supply.is_on and all(camera.is_usable for camera in cameras)):
         await supply.switch_on()
     elif cameras:
-        supply.tell_identities()
+        supply.publish_identities()
     for camera in cameras:
         await check_temperature(camera, assembly.hub, assembly.clock)
 
 
-async def _recording(
-    job: Job, directory: Path, assembly: Assembly, early: _Early, disk: DiskProcess | None
+async def _start_recorder(
+    job: Job, directory: Path, assembly: Assembly, early: _EarlyEvents, disk: DiskProcess | None
 ) -> Recorder:
     """The recorder, started; a disk that refuses it leaves the stand safe, as everything after this does."""
-    recorder = recorder_of(job.order, directory, _info(job, directory, assembly), assembly, disk)
-    await recorder.begin(early.taken)
+    recorder = make_run_recorder(job.order, directory, _make_info(job, directory, assembly), assembly, disk)
+    await recorder.begin(early.take)
     return recorder
 
 
-def _info(job: Job, directory: Path, assembly: Assembly) -> SessionInfo:
+def _make_info(job: Job, directory: Path, assembly: Assembly) -> SessionInfo:
     """The session's metadata; SessionError when the camera is another one than before the interruption."""
     if job.before is None:
         recipe, config = job.order.recipe.name, job.order.config
-        return info_of(recipe, directory.name, config, camera_serials(assembly), assembly.clock, job.seed)
+        return make_session_info(
+            recipe, directory.name, config, list_camera_serials(assembly), assembly.clock, job.seed
+        )
     if job.before.kept.set_up.camera_on:
-        answers, recorded = camera_serials(assembly), job.before.info.camera_serial
+        answers, recorded = list_camera_serials(assembly), job.before.info.camera_serial
         if answers != recorded:
             raise SessionError(f"{directory}: was recorded with camera {recorded}, now {answers} answers")
     return job.before.info
@@ -516,7 +522,7 @@ def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> N
         raise SessionError(f"{directory}: complete, but {recorder.frames_lost} frames were lost; its events say why")
 
 
-class _Early:
+class _EarlyEvents:
     """A subscriber that keeps the events from before there is a recorder."""
 
     def __init__(self) -> None:
@@ -526,12 +532,12 @@ class _Early:
         if self._events is not None and isinstance(item, Event):
             self._events.append(item)
 
-    def taken(self) -> tuple[Event, ...]:
+    def take(self) -> tuple[Event, ...]:
         """What there was; nothing is kept from now on."""
         events, self._events = self._events or (), None
         return tuple(events)
 
 
 async def _finish(recorder: Recorder, recording: asyncio.Task[None], stop: Stop) -> None:
-    await cancelled([recording])
-    await recorder.finish(COMPLETE_WITHIN_S if stop.reason is None else FINISH_WITHIN_S, stop.patience)
+    await cancel_all([recording])
+    await recorder.finish(COMPLETE_WITHIN_S if stop.reason is None else FINISH_WITHIN_S, stop.shutdown_deadline)

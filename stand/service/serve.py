@@ -6,7 +6,6 @@ import asyncio
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock, WallClock
 from thermostand.foundation.errors import StandError, StandTripped
 from thermostand.foundation.events import (
@@ -19,26 +18,27 @@ from thermostand.foundation.events import (
     EventKind,
 )
 from thermostand.foundation.files import make_folder
-from thermostand.foundation.helper import Helper
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.repeats import RepeatLimit
-from thermostand.foundation.tasks import cancelled, failure_text
-from thermostand.recording.repair.salvage import salvage_line, salvage_unfinished
+from thermostand.foundation.repeat_limit import RepeatLimit
+from thermostand.foundation.tasks import cancel_all, describe_failure
+from thermostand.foundation.worker_process import WorkerProcess
+from thermostand.foundation.workers import WorkerThread
+from thermostand.recording.repair.salvage import format_salvaged, salvage_unfinished
 from thermostand.recording.writing.disk import FILES_LINE
 from thermostand.stand.assembly import assemble
-from thermostand.stand.config.checked import ATTACHMENT
-from thermostand.stand.config.safe_ranges import accepted_text
+from thermostand.stand.config.check_record import ATTACHMENT
+from thermostand.stand.config.safe_ranges import describe_accepted
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.running.opening.claim import claimed
 from thermostand.stand.running.opening.clock_watch import ClockWatch
-from thermostand.stand.running.opening.open_stand import opened
+from thermostand.stand.running.opening.open_stand import open_assembly
+from thermostand.stand.running.opening.stand_lock import lock_stand
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.session_report import report_session
+from thermostand.stand.service.counters import CountersFile, load_counters
 from thermostand.stand.service.daemon import Daemon, Front
-from thermostand.stand.service.daemon_file import KeptFile, kept_in
-from thermostand.stand.service.day_record import DayRecord
-from thermostand.stand.service.orders import Orders
-from thermostand.stand.serving.alerts import alerting
+from thermostand.stand.service.idle_log import IdleLog
+from thermostand.stand.service.run_queue import RunQueue
+from thermostand.stand.serving.alerts import send_alerts
 from thermostand.stand.serving.preview_process import MODULE
 
 # The reports of runs that have come to their end, by a process of its own at the lowest priority: a night can be read
@@ -47,7 +47,7 @@ from thermostand.stand.serving.preview_process import MODULE
 _REPORT = "report"
 
 
-def session_report(path: str) -> list[str]:
+def make_session_report(path: str) -> list[str]:
     """Report a session in its folder; what no temperature explains in it, a sentence each. NotReported. In the process
     that reports."""
     import cv2
@@ -56,7 +56,7 @@ def session_report(path: str) -> list[str]:
     return list(report_session(Path(path), Path(path)).unexplained)
 
 
-class Reports:
+class ReportQueue:
     """One after another. What goes wrong is an event `not_reported`, and nothing else."""
 
     def __init__(self, hub: Hub, clock: Clock) -> None:
@@ -67,34 +67,34 @@ class Reports:
 
     def add(self, session: Path) -> None:
         """Its report, in the session's folder, when its turn has come; event `reported`."""
-        work = asyncio.create_task(self._make(session))
+        work = asyncio.create_task(self._make_report(session))
         self._works.add(work)
         work.add_done_callback(self._works.discard)
 
     async def close(self) -> None:
         """Give up what is not made."""
-        await cancelled(list(self._works))
+        await cancel_all(list(self._works))
 
-    async def _make(self, session: Path) -> None:
+    async def _make_report(self, session: Path) -> None:
         async with self._turn:
-            lane, helper = Lane("report", self._clock, patient=False), None
+            lane, helper = WorkerThread("report", self._clock, patient=False), None
             try:
-                helper = Helper(MODULE, (_REPORT,), "the process that makes reports has ended")
-                for line in await lane.call(helper.line(_REPORT).run, session_report, str(session)):
-                    self._tell(REPORT, line, session=session.name)
-                self._tell(REPORTED, session=session.name)
+                helper = WorkerProcess(MODULE, (_REPORT,), "the process that makes reports has ended")
+                for line in await lane.call(helper.line(_REPORT).run, make_session_report, str(session)):
+                    self._publish(REPORT, line, session=session.name)
+                self._publish(REPORTED, session=session.name)
             except (StandError, OSError) as error:
-                self._tell(NOT_REPORTED, str(error))
+                self._publish(NOT_REPORTED, str(error))
             except Exception as error:  # noqa: BLE001 - a fit that fails ends nothing
                 remedy = f"`compensate report {session} -o report.html` tries again"
-                self._tell(NOT_REPORTED, f"{session.name}: no report: {failure_text(error)}; {remedy}")
+                self._publish(NOT_REPORTED, f"{session.name}: no report: {describe_failure(error)}; {remedy}")
             finally:
                 if helper is not None:
                     helper.close()
                 lane.close()
 
-    def _tell(self, kind: EventKind, said: str = "", /, **data: object) -> None:
-        self._hub.publish(kind.at(self._clock.now_ns(), said, **data))
+    def _publish(self, kind: EventKind, text: str = "", /, **data: object) -> None:
+        self._hub.publish(kind.at(self._clock.now_ns(), text, **data))
 
 
 async def serve(
@@ -112,27 +112,27 @@ async def serve(
     InUse when it belongs to another daemon or run: then nothing was touched. Raises what opening raises, and
     StandTripped when the stand could not be confirmed safe at the end.
     """
-    async with Stop() as stop, claimed(config, None):
+    async with Stop() as stop, lock_stand(config, None):
         hub, clock = Hub(RepeatLimit()), WallClock()
         await asyncio.to_thread(make_folder, out)
-        kept, damage = await asyncio.to_thread(kept_in, out)
+        kept, damage = await asyncio.to_thread(load_counters, out)
         watch = ClockWatch(hub, clock)
         assembly = assemble(config, hub, clock)
         async with AsyncExitStack() as stack:
-            open_stand = await stack.enter_async_context(opened(assembly, watch.run, stop, is_for_one=False))
-            await stack.enter_async_context(alerting(config.name, config.alerts, hub, clock, open_stand.is_well))
+            open_stand = await stack.enter_async_context(open_assembly(assembly, watch.run, stop, is_for_one=False))
+            await stack.enter_async_context(send_alerts(config.name, config.alerts, hub, clock, open_stand.is_well))
             if open_stand.disk is None:
                 raise ValueError("a daemon is on the host's clock, and has a process for its disk")
             own = {name: text for name, text in texts.items() if name in ("config.yaml", ATTACHMENT)}
-            record = DayRecord(assembly, own, out, clock, stop.patience)
-            keep = KeptFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
-            reports = Reports(hub, clock)
+            record = IdleLog(assembly, own, out, clock, stop.shutdown_deadline)
+            keep = CountersFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
+            reports = ReportQueue(hub, clock)
             stack.push_async_callback(reports.close)
-            orders = Orders(open_stand, open_stand.disk, out, config_name, texts)
+            orders = RunQueue(open_stand, open_stand.disk, out, config_name, texts)
             for segment in await orders.repair.call(salvage_unfinished, out):
-                hub.publish(SALVAGED.at(clock.now_ns(), salvage_line(segment)))
-            if accepted := config.accepted():
-                hub.publish(LIMITS_OVERRIDDEN.at(clock.now_ns(), accepted_text(accepted), **accepted))
+                hub.publish(SALVAGED.at(clock.now_ns(), format_salvaged(segment)))
+            if accepted := config.list_accepted():
+                hub.publish(LIMITS_OVERRIDDEN.at(clock.now_ns(), describe_accepted(accepted), **accepted))
             if damage:
                 hub.publish(DAEMON_FILE_DAMAGED.at(clock.now_ns(), damage))
             daemon = Daemon(

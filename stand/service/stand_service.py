@@ -15,8 +15,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.recording.reading.notes import LONGEST_NOTE
 from thermostand.stand.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
-from thermostand.stand.serving.commands import Served, Typed, command
-from thermostand.stand.serving.desk import (
+from thermostand.stand.serving.api_models import (
     LONGEST_RECIPE,
     Conflict,
     DeviceState,
@@ -35,17 +34,18 @@ from thermostand.stand.serving.desk import (
     When,
     Who,
     WrittenStep,
-    seen_state,
+    snapshot_state,
 )
+from thermostand.stand.serving.commands import Served, Typed, command
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from thermostand.foundation.patience import Patience
+    from thermostand.foundation.shutdown_deadline import ShutdownDeadline
     from thermostand.recording.writing.disk import DiskCalls
-    from thermostand.stand.running.course import Course
+    from thermostand.stand.running.run_control import RunControl
     from thermostand.stand.service.host import Host
-    from thermostand.stand.service.orders import Orders
+    from thermostand.stand.service.run_queue import RunQueue
 
 _NOTHING_RUNS = "nothing is run now"
 _NO_QUEUE = "this is one run by itself; a queue is kept, and devices are operated, by `stand serve`"
@@ -155,15 +155,15 @@ class StandService(Served):
     def state(self) -> StandState:
         """As it is now."""
         assembly, run, host = self._assembly, self._run, self.host
-        changes = host.seen()
+        changes = host.get_state_fields()
         if run is not None:
-            changes.update(run.seen())
+            changes.update(run.get_state_fields())
         elif host.guest is not None:
             changes["phase"] = "stopping" if host.is_leaving else "running"
         latch = self._open_stand.latch
         if (fault := latch.fault) is not None:
             changes["fault"] = FaultState(rule=fault.rule, text=fault.text, since_ns=latch.since_ns, data=fault.data)
-        return seen_state(assembly.config, assembly.stand, self.hub, self.clock).model_copy(update=changes)
+        return snapshot_state(assembly.config, assembly.stand, self.hub, self.clock).model_copy(update=changes)
 
     def plan(self) -> tuple[PlanStep, ...]:
         """The plan in force; empty when nothing is run."""
@@ -171,19 +171,19 @@ class StandService(Served):
 
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
         """What an edit would say; nothing is ordered, so nothing is recorded."""
-        return self._running().check_edit(from_index, steps)
+        return self._require_run().check_edit(from_index, steps)
 
     def devices(self) -> tuple[DeviceState, ...]:
         """The commands that devices take by hand, between runs."""
         return self.host.devices()
 
-    async def known_faults(self) -> SimulatedFaults:
+    async def list_simulated_faults(self) -> SimulatedFaults:
         """Of the simulated laboratory."""
-        from thermostand.stand.running.simulated_faults import simulated_faults
+        from thermostand.stand.running.simulated_faults import list_simulated_faults
 
-        return await simulated_faults(self._assembly)
+        return await list_simulated_faults(self._assembly)
 
-    def done(self, verb: str, text: str) -> Done:
+    def make_answer(self, verb: str, text: str) -> Done:
         """With what holds the run now, and what is still under way."""
         stand = self._assembly.stand
         reasons, moving = tuple(sorted(stand.gate.reasons)), tuple(stand.motions.texts)
@@ -208,11 +208,11 @@ class StandService(Served):
 
         Example: stand pause && stand continue
         """
-        run = self._running()
+        run = self._require_run()
         run.pauses_next = given.when == "step"
         if not run.pauses_next:
             self._assembly.stand.gate.hold(OPERATOR)
-        return pause_text(given.when)
+        return describe_pause(given.when)
 
     @command("/run/continue")
     def continue_(self, who: Who) -> str:
@@ -220,8 +220,8 @@ class StandService(Served):
 
         Example: stand continue sessions/20260101T180000Z-thermal-cycle
         """
-        self._running().go_on()
-        return held_text(self._assembly.stand.gate.reasons)
+        self._require_run().go_on()
+        return describe_hold(self._assembly.stand.gate.reasons)
 
     @command("/run/reset", verbs=())
     def reset(self, who: Who) -> str:
@@ -244,7 +244,7 @@ class StandService(Served):
         Example: stand skip 12
         """
         run, step_id = self._step(given.step_id)
-        await _changed(run.executor.skip(step_id))
+        await _change_plan(run.executor.skip(step_id))
         return f"step {given.step_id} is left out"
 
     @command("/run/extend")
@@ -254,13 +254,13 @@ class StandService(Served):
         Example: stand extend 12 30
         """
         run, step_id = self._step(given.step_id)
-        await _changed(run.executor.extend(step_id, given.by_s))
+        await _change_plan(run.executor.extend(step_id, given.by_s))
         return f"step {given.step_id} takes {given.by_s / 60.0:g} min longer"
 
     @command("/run/plan", http="PUT", verbs=())
     async def edit(self, who: Who, given: PlanRequest) -> str:
         """Replace the steps from a place on, none of which was begun. Durable when it is answered."""
-        count = await self._running().edit(given.from_index, given.steps)
+        count = await self._require_run().edit(given.from_index, given.steps)
         return f"the steps from number {given.from_index + 1} on are replaced by {count} others"
 
     @command("/queue", status=201, verbs=("submit", "queue add"), by_secop="recipe")
@@ -272,10 +272,10 @@ class StandService(Served):
 
         Example: stand submit night.yaml --key monday
         """
-        orders, order = self._orders(), RunRequest.model_validate(given.model_dump(exclude={"key"}))
+        orders, order = self._require_queue(), RunRequest.model_validate(given.model_dump(exclude={"key"}))
         entry = await orders.submit(who, order, given.key)
         self.host.wake()
-        return orders.shown_run(entry)
+        return orders.describe_run(entry)
 
     @command("/queue/{run}", http="DELETE", verbs=("queue remove",), title="Remove")
     async def cancel(self, who: Who, given: CancelRequest) -> str:
@@ -283,7 +283,7 @@ class StandService(Served):
 
         Example: stand queue remove 5
         """
-        await self._orders().cancel(given.run)
+        await self._require_queue().cancel(given.run)
         self.host.wake()
         return f"run {given.run} is out of the queue"
 
@@ -293,13 +293,13 @@ class StandService(Served):
 
         Example: stand queue move 5 1
         """
-        await self._orders().move(given.run, given.to)
+        await self._require_queue().move(given.run, given.to)
         return f"run {given.run} has turn {given.to}"
 
     @command("/sessions/{session}/resume", verbs=())
     async def resume(self, who: Who, given: ResumeRequest) -> str:
         """Resume an interrupted run in its session; it is the next one."""
-        orders = self._orders()
+        orders = self._require_queue()
         if self._open_stand.latch.fault is not None:
             raise Conflict("the stand has tripped; reset it first")
         entry = await orders.resume(given.session)
@@ -310,15 +310,15 @@ class StandService(Served):
     async def device(self, who: Who, given: DeviceRequest) -> str:
         """Tell a device something between runs, through the same gate as a run. What takes longer than a moment goes on
         when this is answered, and its failure is an event."""
-        return await self.host.do_by_hand(given.device, given.verb, given.arguments)
+        return await self.host.run_manual_order(given.device, given.verb, given.arguments)
 
     @command("/sessions/{session}/notes", verbs=(), by_secop=None)
     async def note(self, who: Who, given: NoteRequest) -> str:
         """Add a note and tags to a session, running or finished."""
-        from thermostand.stand.running.course import Said, keep
+        from thermostand.stand.running.run_control import OperatorNote, save_note
 
-        said = Said(who, given.text, given.tags)
-        await keep(said, *await self._notes_of(given.session), self.hub, self.clock)
+        text = OperatorNote(who, given.text, given.tags)
+        await save_note(text, *await self._find_notes(given.session), self.hub, self.clock)
         return "noted"
 
     @command("/simulator/faults", verbs=(), by_secop=None)
@@ -334,17 +334,17 @@ class StandService(Served):
         return self._assembly.config.name
 
     @property
-    def patience(self) -> Patience:
+    def shutdown_deadline(self) -> ShutdownDeadline:
         """Of a stand that is closed."""
-        return self._open_stand.patience
+        return self._open_stand.shutdown_deadline
 
     @property
-    def _run(self) -> Course | None:
+    def _run(self) -> RunControl | None:
         """Of the run that has the stand, once it can be asked anything."""
         guest = self.host.guest
         return None if guest is None else guest.course
 
-    def _running(self) -> Course:
+    def _require_run(self) -> RunControl:
         run = self._run
         if run is None:
             raise Conflict(_NOTHING_RUNS)
@@ -352,37 +352,37 @@ class StandService(Served):
             raise Conflict("the run is being ended: the stand is made safe, and nothing else is done")
         return run
 
-    def _step(self, wanted: str) -> tuple[Course, str]:
+    def _step(self, wanted: str) -> tuple[RunControl, str]:
         """A step of the run, by its id, or by its number in the plan."""
-        run = self._running()
+        run = self._require_run()
         plan = run.log.state.plan
         found = [each.step_id for each in plan if wanted in (each.step_id, str(each.index + 1))]
         if not found:
             raise Missing(f"the plan has no step {wanted}; `stand status --plan` shows those there are")
         return run, found[0]
 
-    def _orders(self) -> Orders:
+    def _require_queue(self) -> RunQueue:
         if self.host.orders is None:
             raise Conflict(_NO_QUEUE)
         return self.host.orders
 
-    async def _notes_of(self, session: str) -> tuple[Path, DiskCalls]:
+    async def _find_notes(self, session: str) -> tuple[Path, DiskCalls]:
         """The folder of a session, and what writes its file of notes."""
         if (orders := self.host.orders) is not None:
-            return await orders.reading.call(orders.folder_of, session), orders.notes
-        run = self._running()
+            return await orders.reading.call(orders.find_session, session), orders.notes
+        run = self._require_run()
         if session != run.directory.name:
             raise Missing(f"the session under way is {run.directory.name}; others get notes from `stand session`")
         return run.directory, run.notes
 
 
-def pause_text(when: When) -> str:
+def describe_pause(when: When) -> str:
     """What is said of a pause."""
     begins = "pauses when the step under way is done" if when == "step" else "paused"
     return f"{begins}; `stand continue` ends the pause"
 
 
-def held_text(reasons: Collection[str]) -> str:
+def describe_hold(reasons: Collection[str]) -> str:
     """Whether the run continues, and if not, what may be done about it."""
     if not reasons:
         return "the run continues"
@@ -390,7 +390,7 @@ def held_text(reasons: Collection[str]) -> str:
     return "; ".join([f"still held: {', '.join(sorted(reasons))}", *known])
 
 
-async def _changed(change: Coroutine[None, None, None]) -> None:
+async def _change_plan(change: Coroutine[None, None, None]) -> None:
     """What cannot be done with a plan as it is: Conflict."""
     try:
         await change

@@ -11,7 +11,7 @@ STOPPING, READY, FED = "STOPPING=1", "READY=1", "WATCHDOG=1"
 _EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0
 
 
-def tell(*lines: str) -> None:
+def notify_systemd(*lines: str) -> None:
     """Send these lines to the service manager; nothing when there is none."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
@@ -20,17 +20,17 @@ def tell(*lines: str) -> None:
         manager.sendto("\n".join(lines).encode(), f"\0{address[1:]}" if address.startswith("@") else address)
 
 
-class Status:
+class StatusNotice:
     """What is done now, told when it changes."""
 
     def __init__(self) -> None:
-        self._told = ""
+        self._last_text = ""
 
     def tell(self, text: str) -> None:
         """In a few words, as `systemctl status` shows them."""
-        if text != self._told:
-            self._told = text
-            tell(f"STATUS={text}")
+        if text != self._last_text:
+            self._last_text = text
+            notify_systemd(f"STATUS={text}")
 
 
 def watchdog_s() -> float | None:
@@ -41,13 +41,13 @@ def watchdog_s() -> float | None:
     return None
 
 
-async def extending() -> None:
+async def keep_extending() -> None:
     """Ask for more time while the stand is made safe, until cancelled."""
     while True:
-        tell(STOPPING, extended(_EXTENDED_S), "STATUS=making the stand safe")
+        notify_systemd(STOPPING, make_extension(_EXTENDED_S), "STATUS=making the stand safe")
         await asyncio.sleep(_EXTEND_EVERY_S)
 
 
-def extended(by_s: float) -> str:
+def make_extension(by_s: float) -> str:
     """The line that asks for more time, from now on."""
     return f"EXTEND_TIMEOUT_USEC={round(by_s * 1e6)}"

@@ -21,19 +21,19 @@ from threading import Event as Flag
 from threading import Thread
 from typing import NamedTuple
 
-from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, boot_time_ns, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, boot_time_ns, to_ns
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.events import ALERT_FAILED, RUN_BEGINS, RUN_END, RUN_FAILED, TITLES, AlertCause, alert_of
-from thermostand.foundation.helper import Helper
+from thermostand.foundation.events import ALERT_FAILED, RUN_BEGINS, RUN_END, RUN_FAILED, TITLES, AlertCause, make_alert
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
-from thermostand.foundation.tasks import cancelled, cause_of, failure_text
+from thermostand.foundation.tasks import cancel_all, describe_failure, find_cause
+from thermostand.foundation.worker_process import WorkerProcess
 from thermostand.stand.config.alerts_section import AlertsConfig, load_secrets
 from thermostand.stand.serving.alerts_process import MISSING, MODULE, Failures, deliver, ping, run_command
 
 # Which events of a stand become messages: each cause once, when it has lasted, and once more when it is over.
 
-_HOUR_NS = seconds_ns(3600)
+_HOUR_NS = to_ns(3600)
 _BAD: frozenset[AlertCause] = frozenset({"trip", "hold", "device_lost", "disk"})
 
 
@@ -46,7 +46,7 @@ class AlertMessage(NamedTuple):
 
 
 @dataclass
-class AlertBook:
+class AlertTracker:
     """Which messages are due. Of one cause and key there is one message until it is over; a run's begin or end, and
     what has no end, are sent each time. With more than most_per_h in an hour only trips are sent, and how many were
     left out."""
@@ -69,26 +69,26 @@ class AlertBook:
 
     def receive(self, event: Event, now_ns: int) -> list[AlertMessage]:
         """What is to be sent at once."""
-        alert = alert_of(event)
+        alert = make_alert(event)
         if alert is None:
             return []
         if alert.phase == "over":
             before = self._open.pop((alert.cause, alert.key), None)
             text = f"{event.text} (it was: {before[0].text})" if before else ""
-            return self._limited([(alert.cause, "ok again", text)] if before and before[1] else [], now_ns)
+            return self._limit([(alert.cause, "ok again", text)] if before and before[1] else [], now_ns)
         if event.kind in (*RUN_BEGINS, RUN_END):
             self._open = {}
             self._run_ended = event.kind == RUN_END
         elif event.kind == RUN_FAILED and self._run_ended:
             return []
         if alert.cause not in _BAD:
-            return self._limited([(alert.cause, TITLES[alert.cause], event.text)], now_ns)
+            return self._limit([(alert.cause, TITLES[alert.cause], event.text)], now_ns)
         known = self._open.get((alert.cause, alert.key))
         if known is not None and (known[1] or alert.phase == "lasting"):
             return []
         is_due = alert.phase == "raised"
         self._open[alert.cause, alert.key] = (event, is_due)
-        return self._limited([(alert.cause, TITLES[alert.cause], event.text)] if is_due else [], now_ns)
+        return self._limit([(alert.cause, TITLES[alert.cause], event.text)] if is_due else [], now_ns)
 
     def due(self, now_ns: int) -> list[AlertMessage]:
         """What has lasted for the grace time by now."""
@@ -97,9 +97,9 @@ class AlertBook:
             if not was_sent and now_ns - event.time_ns >= self.grace_ns:
                 self._open[cause, key] = (event, True)
                 found.append((cause, TITLES[cause], event.text))
-        return self._limited(found, now_ns)
+        return self._limit(found, now_ns)
 
-    def _limited(self, found: Iterable[tuple[AlertCause, str, str]], now_ns: int) -> list[AlertMessage]:
+    def _limit(self, found: Iterable[tuple[AlertCause, str, str]], now_ns: int) -> list[AlertMessage]:
         """Those that are wanted, and within what an hour may have."""
         messages: list[AlertMessage] = []
         while self._sent_ns and now_ns - self._sent_ns[0] >= _HOUR_NS:
@@ -120,7 +120,7 @@ class AlertBook:
 _LIMIT_S = 20.0  # for an address
 _LOOK_S = 0.5
 _BEAT_S = 1.0
-_LATE_NS = seconds_ns(15.0)  # an event loop that has not come round for so long is not well
+_LATE_NS = to_ns(15.0)  # an event loop that has not come round for so long is not well
 _AGAIN_S = (15.0, 60.0, 300.0, 1200.0)  # after a try that failed: networks come back
 _MOST_WAITING = 100  # round number; nothing was measured
 _FAREWELL_S = 5.0  # real seconds for the last messages
@@ -148,7 +148,7 @@ def check_alerts(config: AlertsConfig) -> None:
 
 
 @asynccontextmanager
-async def alerting(
+async def send_alerts(
     name: str, config: AlertsConfig, hub: Hub, clock: Clock, is_well: Callable[[], bool] = lambda: True
 ) -> AsyncGenerator[None]:
     """Alerts of the stand `name` while inside, none in virtual time or without a receiver. is_well: whether the sign of
@@ -165,11 +165,11 @@ async def alerting(
     try:
         yield
     except Exception as raised:
-        alerts(RUN_FAILED.at(clock.now_ns(), failure_text(cause_of(raised))))
+        alerts(RUN_FAILED.at(clock.now_ns(), describe_failure(find_cause(raised))))
         raise
     finally:
         hub.unsubscribe(alerts)
-        await cancelled([beating])
+        await cancel_all([beating])
         await asyncio.to_thread(alerts.close)
 
 
@@ -184,16 +184,16 @@ class Alerts:
         self._loop, self._hub, self._clock = loop, hub, clock
         self._ending = Flag()
         self._beat_ns = 0
-        grace_ns = seconds_ns(config.grace_s)
+        grace_ns = to_ns(config.grace_s)
         self._senders: list[_Sender] = []
         self._deliveries: list[_Delivery] = []
         if config.command:
-            book = AlertBook(name, config.command_causes, grace_ns, config.most_per_h)
+            book = AlertTracker(name, config.command_causes, grace_ns, config.most_per_h)
             send = partial(run_command, config.command, config.command_limit_s)
             self._deliveries.append(_Delivery(book, send, self._sender("command"), clock))
         works: list[Callable[[], None]] = []
         if config.secrets is not None:
-            book = AlertBook(name, config.causes, grace_ns, config.most_per_h)
+            book = AlertTracker(name, config.causes, grace_ns, config.most_per_h)
             send = partial(deliver, config.secrets, _LIMIT_S)
             self._deliveries.append(_Delivery(book, send, self._sender("addresses"), clock))
             works.append(partial(self._ping_on, config.secrets, self._sender("alive")))
@@ -204,7 +204,7 @@ class Alerts:
 
     def __call__(self, item: Item) -> None:
         """Take note of an event; returns at once."""
-        if isinstance(item, Event) and alert_of(item) is not None:
+        if isinstance(item, Event) and make_alert(item) is not None:
             for delivery in self._deliveries:
                 delivery.events.put(item)
 
@@ -217,7 +217,7 @@ class Alerts:
     def close(self) -> None:
         """Send what is due, as far as that goes in a few seconds; blocking. A command under way runs to its end."""
         self._ending.set()
-        until_ns = boot_time_ns() + seconds_ns(_FAREWELL_S)
+        until_ns = boot_time_ns() + to_ns(_FAREWELL_S)
         for thread in self._threads:
             thread.join(max(0.0, (until_ns - boot_time_ns()) / NS_PER_S))
         for sender in self._senders:
@@ -234,7 +234,7 @@ class Alerts:
             now_ns = boot_time_ns()
             is_well = all(delivery.book.is_well for delivery in self._deliveries)
             if now_ns >= due_ns and now_ns - self._beat_ns < _LATE_NS and is_well:
-                due_ns = now_ns + seconds_ns(self._every_s)
+                due_ns = now_ns + to_ns(self._every_s)
                 sender.ask(partial(ping, secrets, _LIMIT_S))
 
     def _warn(self, failure: str) -> None:
@@ -263,13 +263,13 @@ class _Sender:
 
     line: str
     warn: Callable[[str], None]
-    _helper: Helper | None = None
+    _helper: WorkerProcess | None = None
     _failed: set[str] = field(default_factory=set[str])
 
-    def start(self) -> Helper:
+    def start(self) -> WorkerProcess:
         """Raises OSError when it cannot be started."""
         if self._helper is None or self._helper.ended:
-            self._helper = Helper(MODULE, (self.line,), "the process that sends alerts has ended")
+            self._helper = WorkerProcess(MODULE, (self.line,), "the process that sends alerts has ended")
         return self._helper
 
     def ask(self, call: partial[Failures]) -> Failures:
@@ -294,7 +294,7 @@ class _Sender:
 class _Delivery:
     """Judges events, and sends the messages that are due to receivers of one kind: its `work` is a thread."""
 
-    def __init__(self, book: AlertBook, send: partial[Failures], sender: _Sender, clock: Clock) -> None:
+    def __init__(self, book: AlertTracker, send: partial[Failures], sender: _Sender, clock: Clock) -> None:
         self.book = book
         self.events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._send, self._sender, self._clock = send, sender, clock
@@ -326,5 +326,5 @@ class _Delivery:
             return
         failures = self._sender.ask(partial(self._send, due.message.title, due.message.text, due.only))
         if failures and due.tried < len(_AGAIN_S):
-            at_ns, of = boot_time_ns() + seconds_ns(_AGAIN_S[due.tried]), tuple(number for number, _ in failures)
+            at_ns, of = boot_time_ns() + to_ns(_AGAIN_S[due.tried]), tuple(number for number, _ in failures)
             self._waiting.append(_Waiting(due.message, at_ns, due.tried + 1, due.only if 0 in of else of))

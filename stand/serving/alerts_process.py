@@ -1,4 +1,4 @@
-"""The process that sends alerts for a daemon, see foundation/helper.py.
+"""The process that sends alerts for a daemon, see foundation/worker_process.py.
 
 A receiver that hangs hangs this process's thread, never the daemon. The secrets are read here, again for each message,
 and nothing that is returned holds any of them. A command under way when the daemon goes is run to its end.
@@ -46,7 +46,7 @@ def deliver(secrets: Path, limit_s: float, title: str, text: str, only: Sequence
         if not only or number in only
     }
     return [
-        (number, f"receiver {number} of {len(urls)} ({_scheme(urls[number - 1])}) {failure}")
+        (number, f"receiver {number} of {len(urls)} ({_get_scheme(urls[number - 1])}) {failure}")
         for number, work in works.items()
         if (failure := work.result(limit_s))
     ]
@@ -58,7 +58,7 @@ def ping(secrets: Path, limit_s: float) -> Failures:
         url = load_secrets(secrets).alive_url
     except ConfigError as error:
         return [(0, str(error))]
-    failure = _Work(lambda: _called(url, limit_s)).result(limit_s) if url else ""
+    failure = _Work(lambda: _call_url(url, limit_s)).result(limit_s) if url else ""
     return [(0, f"alive_url {failure}")] if failure else []
 
 
@@ -93,7 +93,7 @@ def _kill(process: subprocess.Popen[bytes]) -> str:
     return ""
 
 
-def _scheme(url: str) -> str:
+def _get_scheme(url: str) -> str:
     scheme = url.partition("://")[0]
     return scheme if scheme.isalnum() and len(scheme) <= 20 and scheme != url else "no address"
 
@@ -116,7 +116,7 @@ def _send(url: str, title: str, text: str) -> str:
     return "" if is_taken else "did not take the message"
 
 
-def _called(url: str, limit_s: float) -> str:
+def _call_url(url: str, limit_s: float) -> str:
     opener = urllib.request.build_opener(urllib.request.ProxyHandler())
     with opener.open(url, timeout=limit_s) as answer:
         answer.read(1000)

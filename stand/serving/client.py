@@ -22,9 +22,9 @@ from urllib.parse import urlsplit
 from pydantic import ValidationError
 
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.files import unreadable
-from thermostand.stand.serving.desk import StandState
-from thermostand.stand.serving.presence import STOP_SUFFIX, LiveDaemon, address_in, living, opened_folder
+from thermostand.foundation.files import describe_unreadable
+from thermostand.stand.serving.api_models import StandState
+from thermostand.stand.serving.instances import STOP_SUFFIX, LiveDaemon, list_daemons, make_socket_address, open_folder
 
 API = "/api/v1"
 LIMIT_S = 5.0  # as bridge.COMMAND_LIMIT_S
@@ -48,22 +48,22 @@ class Server:
     ) -> object:
         """The JSON it answers, None when that is empty. SessionError when it does not answer, or refuses: then with its
         sentence."""
-        return self._understood(*self._answered(method, path, body, timeout_s)[:2])
+        return self._parse_answer(*self._exchange(method, path, body, timeout_s)[:2])
 
-    def picture(self, timeout_s: float = LIMIT_S) -> tuple[int, bytes] | None:
+    def fetch_picture(self, timeout_s: float = LIMIT_S) -> tuple[int, bytes] | None:
         """The last frame: its time in ns since the epoch, on the stand's clock, and a JPEG; None when there is none.
         SessionError as `request`."""
-        status, content, headers = self._answered("GET", f"{API}/frame.jpg", None, timeout_s)
+        status, content, headers = self._exchange("GET", f"{API}/frame.jpg", None, timeout_s)
         if status != http.HTTPStatus.OK:
-            self._understood(status, content)
+            self._parse_answer(status, content)
             return None
         return int(headers.get("x-time-ns", "0")), content
 
-    def _answered(
+    def _exchange(
         self, method: str, path: str, body: Mapping[str, object] | None, timeout_s: float, spent_s: float = 0.0
     ) -> tuple[int, bytes, http.client.HTTPMessage]:
         """Status, content and headers. spent_s: how much of the time is gone already."""
-        connection = self._connection(timeout_s - spent_s)
+        connection = self._make_connection(timeout_s - spent_s)
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         try:
             with suppress(BrokenPipeError):  # it may have refused before it was asked
@@ -99,7 +99,7 @@ class Server:
             with suppress(SessionError):
                 return replace(self, socket=self.socket.with_suffix(STOP_SUFFIX)).order(verb, None, timeout_s / 2)
             spent_s = time.monotonic() - begun_s
-        answer = self._understood(*self._answered("POST", f"{API}/run/{verb}", body, timeout_s, spent_s)[:2])
+        answer = self._parse_answer(*self._exchange("POST", f"{API}/run/{verb}", body, timeout_s, spent_s)[:2])
         if not isinstance(answer, dict):
             raise SessionError(f"{self.name}: its daemon sent {_UNKNOWN}")
         return cast("Answer", answer)
@@ -111,14 +111,14 @@ class Server:
         except ValidationError as error:
             raise SessionError(f"{self.name}: its daemon sent {_UNKNOWN}") from error
 
-    def _connection(self, timeout_s: float) -> http.client.HTTPConnection:
+    def _make_connection(self, timeout_s: float) -> http.client.HTTPConnection:
         if self.socket is not None:
             return _UnixConnection(self.socket, timeout_s)
         parts = urlsplit(self.url)
         kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         return kind(parts.hostname or "", parts.port, timeout=timeout_s)
 
-    def _understood(self, status: int, text: bytes) -> object:
+    def _parse_answer(self, status: int, text: bytes) -> object:
         if status == http.HTTPStatus.NO_CONTENT:
             return None
         try:
@@ -151,8 +151,8 @@ class _UnixConnection(http.client.HTTPConnection):
         seconds, rest_s = divmod(self._limit_s, 1.0)
         daemon.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(seconds), int(1e6 * rest_s)))
         try:
-            with opened_folder(self._path.parent) as folder:
-                daemon.connect(address_in(folder, self._path.name))
+            with open_folder(self._path.parent) as folder:
+                daemon.connect(make_socket_address(folder, self._path.name))
             daemon.settimeout(self._limit_s)
         except BaseException:
             daemon.close()
@@ -160,7 +160,7 @@ class _UnixConnection(http.client.HTTPConnection):
         self.sock = daemon
 
 
-def server_at(url: str, token_file: Path | None = None) -> Server:
+def make_server(url: str, token_file: Path | None = None) -> Server:
     """The stand at `http://host:port`, with the token in the file; ConfigError when either is wrong."""
     try:
         parts = urlsplit(url)
@@ -174,59 +174,59 @@ def server_at(url: str, token_file: Path | None = None) -> Server:
     try:
         token = token_file.read_text("utf-8").strip() if token_file is not None else ""
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--token-file {unreadable(token_file or '', error)}") from error
+        raise ConfigError(f"--token-file {describe_unreadable(token_file or '', error)}") from error
     if not token.isprintable() or not token.isascii():
         raise ConfigError(f"--token-file {token_file}: expected one line with a token")
     return Server(url, url=url, token=token)
 
 
-def server_of(session: Path) -> Server:
+def find_session_server(session: Path) -> Server:
     """The daemon that runs `session`: the folder's name of today, or the name it had when the run began. SessionError
     when there is none."""
-    found = _named(session, living())
+    found = _select_daemons(session, list_daemons())
     if not found:
         raise SessionError(f"{session}: no daemon is running this session")
     return Server(str(session), found[0].socket)
 
 
-def running_sessions(root: Path | None = None) -> list[Path]:
+def list_running_sessions(root: Path | None = None) -> list[Path]:
     """The sessions that a daemon of this user is running now: `root` itself when it is one, else those directly below
     it, by their present names as far as the disk gives them; all of this machine without `root`."""
-    daemons = living()
+    daemons = list_daemons()
     if root is None:
         return sorted(Path(daemon.entry.session) for daemon in daemons)
-    if _named(root, daemons):
+    if _select_daemons(root, daemons):
         return [root]
-    paths = _spellings(root)
-    known = [daemon for daemon in daemons if not paths.isdisjoint(map(os.path.dirname, _paths(daemon)))]
+    paths = _list_spellings(root)
+    known = [daemon for daemon in daemons if not paths.isdisjoint(map(os.path.dirname, _list_paths(daemon)))]
     here = {root / os.path.basename(daemon.entry.session) for daemon in known}
     moved = {daemon.entry.identity for daemon in daemons if daemon not in known} - {None}
     if moved:  # into this folder, perhaps
-        found = _asked_disk(lambda: [path for path in root.iterdir() if _identity(path) in moved])
+        found = _ask_disk(lambda: [path for path in root.iterdir() if _get_identity(path) in moved])
         here.update(found or ())
     return sorted(here)
 
 
-def _named(session: Path, daemons: list[LiveDaemon]) -> list[LiveDaemon]:
+def _select_daemons(session: Path, daemons: list[LiveDaemon]) -> list[LiveDaemon]:
     """Those that run `session`, by its name, else by the folder that has this name now."""
-    paths = _spellings(session)
-    named = [daemon for daemon in daemons if not paths.isdisjoint(_paths(daemon))]
+    paths = _list_spellings(session)
+    named = [daemon for daemon in daemons if not paths.isdisjoint(_list_paths(daemon))]
     if len(named) == 1 or not daemons:
         return named
-    identity = _asked_disk(lambda: _identity(session))
+    identity = _ask_disk(lambda: _get_identity(session))
     same = [daemon for daemon in daemons if identity is not None and daemon.entry.identity == identity]
     return same or named
 
 
-def _paths(daemon: LiveDaemon) -> set[str]:
+def _list_paths(daemon: LiveDaemon) -> set[str]:
     return {daemon.entry.session, daemon.entry.real_path} - {""}
 
 
-def _spellings(path: Path) -> set[str]:
-    return {os.path.abspath(path), _asked_disk(lambda: os.path.realpath(path)) or os.path.abspath(path)}
+def _list_spellings(path: Path) -> set[str]:
+    return {os.path.abspath(path), _ask_disk(lambda: os.path.realpath(path)) or os.path.abspath(path)}
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def _get_identity(path: Path) -> tuple[int, int] | None:
     try:
         found = path.stat()
     except OSError:
@@ -234,7 +234,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _asked_disk(question: Callable[[], Result]) -> Result | None:
+def _ask_disk(question: Callable[[], Result]) -> Result | None:
     """The answer; None when the disk refuses it, or does not give it within _DISK_LIMIT_S."""
     answers: list[Result] = []
 

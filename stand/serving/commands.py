@@ -26,7 +26,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import COMMAND
 from thermostand.foundation.hub import Hub
-from thermostand.stand.serving.desk import (
+from thermostand.stand.serving.api_models import (
     DeviceState,
     Done,
     PlanCheck,
@@ -111,7 +111,7 @@ class Command(_Mark):
         """What SECoP's command takes, "" for nothing; None when there is none."""
         fields = {} if self.argument is None else self.argument.model_fields
         needed = [name for name, info in fields.items() if info.is_required()]
-        return self.by_secop if self.by_secop or self.by_secop is None else _only(needed)
+        return self.by_secop if self.by_secop or self.by_secop is None else _get_only(needed)
 
     @property
     def summary(self) -> str:
@@ -124,21 +124,21 @@ class Command(_Mark):
         return tuple(re.findall(r"{(\w+)}", self.path))
 
 
-def _only(names: Sequence[str]) -> str | None:
+def _get_only(names: Sequence[str]) -> str | None:
     return None if len(names) > 1 else "".join(names)
 
 
-def commands_of(service: type[Served]) -> dict[str, Command]:
+def collect_commands(service: type[Served]) -> dict[str, Command]:
     """Every command of a service, by name, those of its bases first."""
     marked: dict[str, tuple[Callable[..., object], _Mark]] = {}
     for each in reversed(service.__mro__):
         for name, method in vars(each).items():
             if isinstance(mark := getattr(method, _MARK, None), _Mark):
                 marked[name] = method, mark
-    return {each.name: each for each in (_command(name, *found) for name, found in marked.items())}
+    return {each.name: each for each in (_make_command(name, *found) for name, found in marked.items())}
 
 
-def _command(method_name: str, method: Callable[..., object], mark: _Mark) -> Command:
+def _make_command(method_name: str, method: Callable[..., object], mark: _Mark) -> Command:
     hints = get_type_hints(method)
     answer = hints.pop("return")
     argument = [hint for hint in hints.values() if hint is not Who]
@@ -161,7 +161,7 @@ class Served(ABC):
     def __init__(self, hub: Hub, clock: Clock) -> None:
         self.hub = hub
         self.clock = clock
-        self.commands = commands_of(type(self))
+        self.commands = collect_commands(type(self))
 
     @abstractmethod
     def state(self) -> StandState:
@@ -181,11 +181,11 @@ class Served(ABC):
         """The commands that devices take by hand."""
 
     @abstractmethod
-    async def known_faults(self) -> SimulatedFaults:
+    async def list_simulated_faults(self) -> SimulatedFaults:
         """What can be broken on purpose; Conflict when the stand is no simulated one."""
 
     @abstractmethod
-    def done(self, verb: str, text: str) -> Done:
+    def make_answer(self, verb: str, text: str) -> Done:
         """The answer to a command of which that sentence came."""
 
     def perform(self, name: str, who: Who, given: Document | None = None) -> BaseModel | Awaitable[BaseModel]:
@@ -195,32 +195,32 @@ class Served(ABC):
         try:
             came = getattr(self, found.method)(who, *(() if found.argument is None else (given,)))
         except StandError as error:
-            self.record(who, name, given, f"refused: {error}")
+            self.publish_command(who, name, given, f"refused: {error}")
             raise
         if inspect.isawaitable(came):
-            return self._completed(who, name, given, came)
-        return self._came(who, name, given, came)
+            return self._complete(who, name, given, came)
+        return self._record_result(who, name, given, came)
 
-    async def _completed(self, who: Who, name: str, given: Document | None, work: Awaitable[Any]) -> BaseModel:
+    async def _complete(self, who: Who, name: str, given: Document | None, work: Awaitable[Any]) -> BaseModel:
         try:
             came = await work
         except StandError as error:
-            self.record(who, name, given, f"refused: {error}")
+            self.publish_command(who, name, given, f"refused: {error}")
             raise
-        return self._came(who, name, given, came)
+        return self._record_result(who, name, given, came)
 
-    def _came(self, who: Who, name: str, given: Document | None, came: object) -> BaseModel:
-        self.record(who, name, given)
-        return self.done(name, came) if isinstance(came, str) else cast("BaseModel", came)
+    def _record_result(self, who: Who, name: str, given: Document | None, came: object) -> BaseModel:
+        self.publish_command(who, name, given)
+        return self.make_answer(name, came) if isinstance(came, str) else cast("BaseModel", came)
 
-    def record(self, who: Who, name: str, given: Document | None, result: str = "done") -> None:
+    def publish_command(self, who: Who, name: str, given: Document | None, result: str = "done") -> None:
         """The event of a command: who, how, what, and what came of it."""
-        arguments = recorded(given)
+        arguments = summarize_argument(given)
         data = {"who": who.name, "how": who.how, "verb": name, "arguments": arguments, "result": result}
-        self.hub.publish(COMMAND.at(self.clock.now_ns(), in_words(name, arguments), **data))
+        self.hub.publish(COMMAND.at(self.clock.now_ns(), describe_command(name, arguments), **data))
 
 
-def recorded(given: Document | None) -> dict[str, JsonValue]:
+def summarize_argument(given: Document | None) -> dict[str, JsonValue]:
     """What an event has of an argument: no long text, of steps how many there are, nothing that is empty, and no flag
     that was not set."""
     if given is None:
@@ -235,14 +235,14 @@ def _is_left_out(value: object) -> bool:
     return value is None or value in ("", [], {}) or (isinstance(value, str) and len(value) > _LONGEST)
 
 
-def in_words(verb: str, arguments: Mapping[str, JsonValue]) -> str:
+def describe_command(verb: str, arguments: Mapping[str, JsonValue]) -> str:
     """`pause when=now`, `skip step_id=0-soak`, `flap open`, `linear move position=12.0`."""
     if verb == "device":
         given = arguments.get("arguments")
-        pairs = _pairs(given) if isinstance(given, Mapping) else []
+        pairs = _format_pairs(given) if isinstance(given, Mapping) else []
         return " ".join([str(arguments.get("device")), str(arguments.get("verb")), *pairs])
-    return " ".join([verb, *_pairs({name: value for name, value in arguments.items() if name != "key"})])
+    return " ".join([verb, *_format_pairs({name: value for name, value in arguments.items() if name != "key"})])
 
 
-def _pairs(arguments: Mapping[str, JsonValue]) -> list[str]:
+def _format_pairs(arguments: Mapping[str, JsonValue]) -> list[str]:
     return [f"{name}={value}" for name, value in arguments.items() if value not in ("", [], None)]

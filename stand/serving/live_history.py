@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Quality
 
@@ -69,14 +69,14 @@ class Columns:
             "from_ns": self.from_ns,
             "width_ns": self.width_ns,
             "points": self.points,
-            "low": {name: _numbers(values) for name, values in self.low.items()},
-            "high": {name: _numbers(self.high[name]) for name in different},
+            "low": {name: _round_numbers(values) for name, values in self.low.items()},
+            "high": {name: _round_numbers(self.high[name]) for name in different},
             "units": dict(self.units),
             "marks": [asdict(mark) for mark in self.marks],
         }
 
 
-def _numbers(values: Float) -> list[float | None]:
+def _round_numbers(values: Float) -> list[float | None]:
     """Four decimals are a tenth of a millikelvin and of a millipixel: more would only be bytes."""
     rounded = np.round(values.astype(np.float64), 4).tolist()
     return [None if value != value else value for value in rounded]
@@ -86,13 +86,13 @@ class _Ring:
     """Cells of one width for all channels; `newest` is the number of the latest cell, -1 before the first reading."""
 
     def __init__(self, width_s: float, cells: int) -> None:
-        self.width_ns = seconds_ns(width_s)
+        self.width_ns = to_ns(width_s)
         self.cells = cells
         self.newest = -1
         self._low: Float = np.empty((0, cells), np.float32)
         self._high: Float = np.empty((0, cells), np.float32)
 
-    def make_room(self, rows: int) -> None:
+    def resize(self, rows: int) -> None:
         """For so many channels."""
         more = np.full((rows - len(self._low), self.cells), np.inf, np.float32)
         self._low, self._high = np.concatenate((self._low, more)), np.concatenate((self._high, -more))
@@ -101,7 +101,7 @@ class _Ring:
         """One reading; NaN is a BAD one. What is older than the ring is not kept."""
         cell = time_ns // self.width_ns
         if cell > self.newest:
-            self._reach(cell)
+            self._advance_to(cell)
         elif cell <= self.newest - self.cells:
             return
         at = cell % self.cells
@@ -115,22 +115,22 @@ class _Ring:
         """Many readings at once, in order of time."""
         cells = times_ns // self.width_ns
         if len(cells) and cells[-1] > self.newest:
-            self._reach(int(cells[-1]))
+            self._advance_to(int(cells[-1]))
         kept = cells > self.newest - self.cells
         at, values = cells[kept] % self.cells, values[kept].astype(np.float32)
         np.minimum.at(self._low[row], at, np.nan_to_num(values, nan=_BAD))
         np.maximum.at(self._high[row], at, np.nan_to_num(values, nan=-_BAD))
 
-    def absorb(self, row: int, other: _Ring, other_row: int) -> None:
+    def merge(self, row: int, other: _Ring, other_row: int) -> None:
         """Another ring's channel of the same cells, as far as they are not too old."""
         if other.newest > self.newest:
-            self._reach(other.newest)
+            self._advance_to(other.newest)
         numbers = np.arange(max(other.newest, self.newest) - self.cells + 1, other.newest + 1)
         at = numbers % self.cells
         self._low[row, at] = np.minimum(self._low[row, at], other._low[other_row, at])
         self._high[row, at] = np.maximum(self._high[row, at], other._high[other_row, at])
 
-    def reaches_back_ns(self) -> int:
+    def get_oldest_ns(self) -> int:
         """The instant of the oldest cell that may hold something."""
         return (self.newest - self.cells + 1) * self.width_ns
 
@@ -155,7 +155,7 @@ class _Ring:
             begin = stop
         return low, high
 
-    def _reach(self, cell: int) -> None:
+    def _advance_to(self, cell: int) -> None:
         """Make `cell` the newest; the cells that were not there yet are empty."""
         count = min(cell - self.newest, self.cells)
         begin, end = (cell - count + 1) % self.cells, cell % self.cells + 1
@@ -172,9 +172,9 @@ class History:
 
     def __init__(self) -> None:
         self._rings = (_Ring(FINE_S, FINE_CELLS), _Ring(COARSE_S, COARSE_CELLS))
-        self._room = 8
+        self._capacity = 8
         for ring in self._rings:
-            ring.make_room(self._room)
+            ring.resize(self._capacity)
         self._rows: dict[str, int] = {}
         self._units: dict[str, str] = {}
         self._infos: deque[Mark] = deque(maxlen=MOST_MARKS)  # so many of what is only worth knowing
@@ -199,7 +199,7 @@ class History:
         """Those that there are, in the order of their first reading."""
         return tuple(self._rows)
 
-    def last_ns(self, channel: str) -> int | None:
+    def get_last_ns(self, channel: str) -> int | None:
         """When the latest reading of a channel was made, None when there is none."""
         return self._last_ns.get(channel)
 
@@ -219,14 +219,14 @@ class History:
             for ring in self._rings:
                 ring.fill(row, times_ns, values)
 
-    def absorb(self, other: History) -> None:
+    def merge(self, other: History) -> None:
         """Add what another one has, which was before this one."""
         for channel, other_row in other._rows.items():
             row = self._row(channel, other._units[channel])
             if row is not None:
                 self._last_ns[channel] = max(other._last_ns.get(channel, 0), self._last_ns.get(channel, 0))
                 for ring, others in zip(self._rings, other._rings, strict=True):
-                    ring.absorb(row, others, other_row)
+                    ring.merge(row, others, other_row)
         for marks, others in (
             (self._infos, other._infos),
             (self._warned, other._warned),
@@ -244,7 +244,7 @@ class History:
             kept.append(Mark(item.time_ns, item.level, item.kind, item.text))
             return
         if item.state is StepState.STARTED:
-            self._steps.append(Mark(item.time_ns, "step", item.kind, _role_of(item), item.step_id))
+            self._steps.append(Mark(item.time_ns, "step", item.kind, _get_role(item), item.step_id))
             return
         for index in range(len(self._steps) - 1, max(-1, len(self._steps) - 9), -1):
             step = self._steps[index]
@@ -266,20 +266,20 @@ class History:
             raise ValueError(f"a history's end is after its beginning, not {to_ns} after {from_ns}")
         if not 1 <= points <= MOST_POINTS:
             raise ValueError(f"a history has 1 to {MOST_POINTS} points, not {points}")
-        ring = self._ring_for(from_ns, to_ns, points)
+        ring = self._choose_ring(from_ns, to_ns, points)
         cells = -(-(to_ns - from_ns) // ring.width_ns)
         per_column = max(1, -(-cells // points))
         first = from_ns // ring.width_ns // per_column * per_column  # a curve that moves keeps its columns
         count = -(-(to_ns // ring.width_ns + 1 - first) // per_column)
-        first, count = self._within(ring, first, per_column, count)
+        first, count = self._limit_columns(ring, first, per_column, count)
         width_ns = per_column * ring.width_ns
         holds = max(1, round(_HOLDS_S * NS_PER_S / width_ns))
         names = [name for name in self._rows if channels is None or name in channels]
         rows = [self._rows[name] for name in names]
-        found = _held(*ring.columns(rows, first - holds * per_column, per_column, count + holds), holds)
+        found = _fill_gaps(*ring.columns(rows, first - holds * per_column, per_column, count + holds), holds)
         low, high = (dict(zip(names, values[:, holds:], strict=True)) for values in found)
         units = {name: self._units[name] for name in names}
-        marks = tuple(self._marks(from_ns, to_ns))
+        marks = tuple(self._iterate_marks(from_ns, to_ns))
         return Columns(first * ring.width_ns, width_ns, count, low, high, units, marks)
 
     def _row(self, channel: str, unit: str) -> int | None:
@@ -287,19 +287,19 @@ class History:
         if row is None and len(self._rows) < MOST_CHANNELS and not channel.endswith(_UNKEPT):
             row = self._rows[channel] = len(self._rows)
             self._units[channel] = unit
-            if row >= self._room:
-                self._room *= 2
+            if row >= self._capacity:
+                self._capacity *= 2
                 for ring in self._rings:
-                    ring.make_room(self._room)
+                    ring.resize(self._capacity)
         return row
 
-    def _ring_for(self, from_ns: int, to_ns: int, points: int) -> _Ring:
+    def _choose_ring(self, from_ns: int, to_ns: int, points: int) -> _Ring:
         """The fine one where it goes back far enough and is not finer than what is asked for by much."""
         fine, coarse = self._rings
         is_long = (to_ns - from_ns) // points > coarse.width_ns
-        return coarse if is_long or from_ns < fine.reaches_back_ns() else fine
+        return coarse if is_long or from_ns < fine.get_oldest_ns() else fine
 
-    def _within(self, ring: _Ring, first: int, per_column: int, count: int) -> tuple[int, int]:
+    def _limit_columns(self, ring: _Ring, first: int, per_column: int, count: int) -> tuple[int, int]:
         """The columns that can hold something: nobody is sent a century of nothing."""
         oldest = max(0, ring.newest - ring.cells + 1) // per_column * per_column
         skipped = min(max(0, (oldest - first) // per_column), count)
@@ -307,7 +307,7 @@ class History:
         newest = max(0, -(-(ring.newest + 1 - first) // per_column))
         return first, min(count - skipped, newest + 1)
 
-    def _marks(self, from_ns: int, to_ns: int) -> Iterator[Mark]:
+    def _iterate_marks(self, from_ns: int, to_ns: int) -> Iterator[Mark]:
         found = [
             mark
             for marks in (self._infos, self._warned, self._steps, self._references)
@@ -317,7 +317,7 @@ class History:
         return iter(sorted(found, key=lambda mark: mark.time_ns))
 
 
-def _role_of(mark: StepMark) -> str:
+def _get_role(mark: StepMark) -> str:
     """What the curves name a step by: a capture's role, a chamber's set-point."""
     for name in ("role", "chamber_degC", "text"):
         value = mark.parameters.get(name)
@@ -326,7 +326,7 @@ def _role_of(mark: StepMark) -> str:
     return ""
 
 
-def _held(low: Float, high: Float, holds: int) -> tuple[Float, Float]:
+def _fill_gaps(low: Float, high: Float, holds: int) -> tuple[Float, Float]:
     """Columns without a reading take the one before, over at most `holds` of them; those of BAD readings are NaN."""
     index = np.arange(low.shape[1])
     source = np.maximum.accumulate(np.where(np.isinf(low), -1, index), axis=1)

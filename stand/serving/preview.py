@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.foundation.errors import DetectionError
-from thermostand.markers.detection import Detection, detect, grey_image
+from thermostand.markers.detection import Detection, convert_to_grey, detect
 from thermostand.markers.edge_model import SIGMA
-from thermostand.markers.plane import project, roll_deg
+from thermostand.markers.homography import compute_roll_deg, project
 from thermostand.markers.target import Target
 from thermostand.stand.serving.shot import DRIFT_ROLES, FrameShot, Image
 
@@ -83,7 +83,7 @@ class Previewer:
 
     def look(self, shot: FrameShot) -> Preview:
         """What there is to see in a frame; one without the target has no markers and says why."""
-        grey = grey_image(shot.image)
+        grey = convert_to_grey(shot.image)
         height, width = grey.shape
         found, trouble = None, ""
         try:
@@ -91,10 +91,10 @@ class Previewer:
             self._before[shot.camera] = found
         except DetectionError as error:
             trouble = str(error)
-        jpeg = half_jpeg(shot.image)
+        jpeg = encode_half_jpeg(shot.image)
         common = (shot.camera, shot.time_ns, width, height, shot.role)
         if found is None:
-            return Preview(*common, setup_of(grey, None, self._target), trouble=trouble, jpeg=jpeg)
+            return Preview(*common, measure_setup(grey, None, self._target), trouble=trouble, jpeg=jpeg)
         drift = self._drift(shot, found)
         seen = np.isfinite(found.centres_px[:, 0])
         still = np.isfinite(drift[:, 0])
@@ -103,8 +103,8 @@ class Previewer:
         reference = self._reference.get(shot.camera)
         return Preview(
             *common,
-            setup_of(grey, found, self._target),
-            tuple(_marker(int(index), found.centres_px[index], drift[index]) for index in np.flatnonzero(seen)),
+            measure_setup(grey, found, self._target),
+            tuple(_make_marker(int(index), found.centres_px[index], drift[index]) for index in np.flatnonzero(seen)),
             self._target.count,
             None if mean is None else float(np.hypot(*mean)),
             None if mean is None else float(mean[0]),
@@ -124,12 +124,12 @@ class Previewer:
         return found.centres_px - self._reference[shot.camera][1]
 
 
-def _marker(index: int, centre: Float, drift: Float) -> tuple[int, float, float, float | None, float | None]:
+def _make_marker(index: int, centre: Float, drift: Float) -> tuple[int, float, float, float | None, float | None]:
     x, y, dx, dy = (None if math.isnan(value) else round(value, 4) for value in (*centre.tolist(), *drift.tolist()))
     return index + 1, x or 0.0, y or 0.0, dx, dy
 
 
-def half_jpeg(image: Image) -> bytes:
+def encode_half_jpeg(image: Image) -> bytes:
     """A JPEG of half the width and height; b"" when the picture cannot be encoded."""
     eight = (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
     height, width = eight.shape[:2]
@@ -138,7 +138,7 @@ def half_jpeg(image: Image) -> bytes:
     return data.tobytes() if done else b""
 
 
-def setup_of(grey: Image, found: Detection | None, target: Target) -> Setup:
+def measure_setup(grey: Image, found: Detection | None, target: Target) -> Setup:
     """What helps to set a camera up."""
     top = int(np.iinfo(grey.dtype).max)
     counts = np.bincount(grey.ravel() >> (2 if top == 255 else 10), minlength=_BINS)
@@ -147,21 +147,21 @@ def setup_of(grey: Image, found: Detection | None, target: Target) -> Setup:
     if found is None:
         return Setup(shares, saturated, dark)
     seen = np.isfinite(found.centres_px[:, 0])
-    across, down = keystone_percent(found.homography, target)
+    across, down = compute_keystone_percent(found.homography, target)
     return Setup(
         shares,
         saturated,
         dark,
         float(_EDGE_10_90 * np.median(found.state.parameters[seen, SIGMA])),
         float(np.median(found.state.contrast_DN()[seen])),
-        tilt_deg(found.homography, target),
+        compute_tilt_deg(found.homography, target),
         across,
         down,
-        roll_deg(found.homography, target),
+        compute_roll_deg(found.homography, target),
     )
 
 
-def tilt_deg(homography: Float, target: Target) -> float | None:
+def compute_tilt_deg(homography: Float, target: Target) -> float | None:
     """The angle between target and image plane, from how much shorter it appears across the tilt: arccos of the ratio
     of the homography's two scales at the target's middle. Right near the optical axis, and blind below some degrees;
     None there."""
@@ -172,7 +172,7 @@ def tilt_deg(homography: Float, target: Target) -> float | None:
     return float(np.degrees(np.arccos(ratio))) if ratio < _NEARLY_SQUARE else None
 
 
-def keystone_percent(homography: Float, target: Target) -> tuple[float, float]:
+def compute_keystone_percent(homography: Float, target: Target) -> tuple[float, float]:
     """How much larger the end of the target that is right in the image appears than the left one, and the lower one
     than the upper one, %."""
     nominal = target.coordinates_mm()
@@ -180,13 +180,13 @@ def keystone_percent(homography: Float, target: Target) -> tuple[float, float]:
     middle = (low + high) / 2
     places = np.array([(low[0], middle[1]), (high[0], middle[1]), (middle[0], low[1]), (middle[0], high[1])])
     at = project(homography, places)
-    scales = np.array([_scale(homography, place) for place in places])
+    scales = np.array([_compute_scale(homography, place) for place in places])
     gradient, *_ = np.linalg.lstsq(at - at.mean(axis=0), np.log(scales), rcond=None)
     across, down = gradient * (at.max(axis=0) - at.min(axis=0)) * 100
     return float(across), float(down)
 
 
-def _scale(homography: Float, place: Float) -> float:
+def _compute_scale(homography: Float, place: Float) -> float:
     """px per mm at a place: the square root of the area of a square millimetre."""
     corner, right, up = project(homography, place + _CORNER)
     (ax, ay), (bx, by) = right - corner, up - corner

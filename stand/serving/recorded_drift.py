@@ -38,19 +38,19 @@ class SessionDrift:
 
 
 @dataclass(frozen=True, slots=True)
-class Recalled:
+class RecalledReference:
     """Of one camera of an interrupted run: the frame that drift counts from, and the role of its last frame."""
 
     shot: FrameShot
     last_role: str
 
 
-def run_references(path: Path | str) -> tuple[Recalled, ...]:
+def find_run_references(path: Path | str) -> tuple[RecalledReference, ...]:
     """What drift was measured against when the run of this session was interrupted, for each camera whose frames are
     recorded; found by the rule that held when they came. SessionError when the session cannot be read."""
     session = Session.open(path)
     table = session.frames_table()
-    found: list[Recalled] = []
+    found: list[RecalledReference] = []
     for camera in dict.fromkeys(table.camera.tolist()):
         reference, before = None, ""
         for index in np.flatnonzero((table.camera == camera) & ~table.superseded).tolist():
@@ -60,11 +60,11 @@ def run_references(path: Path | str) -> tuple[Recalled, ...]:
         if reference is not None:
             frame = session.frame(reference)
             shot = FrameShot(camera, frame.time_ns, frame.image, str(table.role[reference]), as_reference=True)
-            found.append(Recalled(shot, before))
+            found.append(RecalledReference(shot, before))
     return tuple(found)
 
 
-def session_drift(path: Path | str, target_text: str) -> SessionDrift:
+def compute_session_drift(path: Path | str, target_text: str) -> SessionDrift:
     """The drift of a session's first camera against its first reference frame (without one: its first frame), in at
     most MOST_FRAMES frames spread over the night. Its own target is taken, else `target_text`. SessionError when the
     session cannot be read."""

@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import StandError
 from thermostand.recording.format.layout import FINISHED, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.stand.serving.live_history import COARSE_CELLS, COARSE_S, Columns, History
 
-WEEK_NS = seconds_ns(COARSE_S * COARSE_CELLS)
+WEEK_NS = to_ns(COARSE_S * COARSE_CELLS)
 
 
-def recorded_week(directory: Path, now_ns: int) -> tuple[History, list[str]]:
+def read_recorded_week(directory: Path, now_ns: int) -> tuple[History, list[str]]:
     """After a restart: what the sessions in `directory` have of the week before `now_ns`, and a sentence for each that
     could not be read."""
     history, troubles = History(), list[str]()
-    for path in _written_since(directory, now_ns - WEEK_NS):
+    for path in _find_sessions_since(directory, now_ns - WEEK_NS):
         try:
             fill_from(history, Session.open(path), now_ns - WEEK_NS)
         except StandError as error:
@@ -29,7 +29,7 @@ def recorded_week(directory: Path, now_ns: int) -> tuple[History, list[str]]:
     return history, troubles
 
 
-def session_columns(path: Path | str, points: int) -> Columns:
+def read_session_columns(path: Path | str, points: int) -> Columns:
     """The whole of one session in at most `points` columns; SessionError when it cannot be read."""
     session, history = Session.open(path), History()
     first_ns, last_ns = fill_from(history, session)
@@ -51,12 +51,12 @@ def fill_from(history: History, session: Session, from_ns: int = 0) -> tuple[int
     return min(ends, default=0), max(ends, default=0)
 
 
-def _written_since(directory: Path, from_ns: int) -> list[Path]:
+def _find_sessions_since(directory: Path, from_ns: int) -> list[Path]:
     """Sessions in which something was written since, oldest first. Files' times are UTC, not the stand's clock, so a
     day more is looked at."""
     found: list[tuple[int, Path]] = []
     for telemetry in directory.glob(f"*/{TELEMETRY}"):
         times = [segment.stat().st_mtime_ns for segment in telemetry.glob(f"*{FINISHED}")]
-        if times and max(times) >= from_ns - seconds_ns(86_400):
+        if times and max(times) >= from_ns - to_ns(86_400):
             found.append((max(times), telemetry.parent))
     return [path for _, path in sorted(found)]

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import cv2
 
-from tests.bench.figures import Figure, Missing, progress, skipped, table
+from tests.bench.figures import Figure, Missing, format_table, make_skipped, report_progress
 
 BENCHMARKS = (
-    *("virtual_time", "night", "abort", "jitter", "viewers", "regulators", "camera", "calibration", "codec"),
+    *("virtual_time", "protocol", "abort", "jitter", "viewers", "regulators", "camera", "calibration", "codec"),
     *(
         "line_rate",
         "reading",
@@ -26,9 +26,9 @@ BENCHMARKS = (
         "claimed_variances",
         "drift",
         "datasheet",
-        "dwells",
+        "soaks",
     ),
-    *("known", "warp", "c_header", "pipeline", "cluster", "identification", "start", "stop", "page"),
+    *("adaptive", "warp", "c_header", "pipeline", "cluster", "identification", "start", "stop", "page"),
 )
 """Modules of this folder with `figures(directory)`, which gives the lines of the table."""
 
@@ -44,18 +44,18 @@ def main() -> None:
     try:
         with tempfile.TemporaryDirectory(prefix="bench-") as folder:
             for name in sys.argv[1:] or BENCHMARKS:
-                progress(f"[{time.monotonic() - begin_s:4.0f} s] {name}")
+                report_progress(f"[{time.monotonic() - begin_s:4.0f} s] {name}")
                 try:
                     for figure in importlib.import_module(f"tests.bench.{name}").figures(Path(folder)):
                         found.append(figure)
                 except Missing as error:
-                    found.append(skipped(name, error))
+                    found.append(make_skipped(name, error))
                 except Exception as error:  # noqa: BLE001 - whatever it is, the others are wanted
                     traceback.print_exc()
-                    found.append(skipped(name, f"failed: {error}"))
+                    found.append(make_skipped(name, f"failed: {error}"))
                     failed.append(name)
     finally:
-        sys.stdout.write(f"\n{_machine()}, {time.monotonic() - begin_s:.0f} s\n\n{table(found)}")
+        sys.stdout.write(f"\n{_machine()}, {time.monotonic() - begin_s:.0f} s\n\n{format_table(found)}")
     if failed:
         sys.exit(f"failed: {', '.join(failed)}")
 

@@ -20,16 +20,16 @@ import numpy as np
 import zstandard
 from mcap.writer import CompressionType
 
-from tests.bench.figures import Figure, at_most, in_turns, progress, ratio_at_most, side_by_side
+from tests.bench.figures import Figure, compare, measure_in_turns, report_progress, set_upper_goal, set_upper_ratio_goal
 from tests.bench.reading import ATTACHMENTS, FRAME_PERIOD_NS, METADATA, START_NS, HEIGHT_px, WIDTH_px, write_telemetry
-from tests.recording.stored import CAMERA_TOPICS, stored
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.layout import FRAMES
-from thermostand.recording.format.mcap_bytes import RECORD, chunk_head
-from thermostand.recording.format.records import frame_places
+from thermostand.recording.format.mcap_bytes import RECORD, parse_chunk_head
+from thermostand.recording.format.records import list_frame_places
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.segment import SeriesForm
+from thermostand.recording.writing.segment import SeriesSpec
 from thermostand.recording.writing.series import Series
 
 COUNT = 400
@@ -39,7 +39,7 @@ ROUNDS = 5
 def figures(directory: Path) -> list[Figure]:
     """The ratio of the times, the memory, and what opening takes."""
     session = directory / "arrays"
-    progress(f"arrays, {COUNT} frames are written")
+    report_progress(f"arrays, {COUNT} frames are written")
     _write(session)
     try:
         runs: list[dict[str, float]] = []
@@ -48,29 +48,33 @@ def figures(directory: Path) -> list[Figure]:
             runs.append(_measure(session, "region"))
             return runs[-1]["s"]
 
-        own, peer = in_turns(ours, lambda: _measure(session, "chunks")["s"], ROUNDS)
+        own, peer = measure_in_turns(ours, lambda: _measure(session, "chunks")["s"], ROUNDS)
         opened = [run["open_ms"] for run in runs]
         memory = [run["MB"] for run in runs]
     finally:
         shutil.rmtree(session, ignore_errors=True)
     what = f"arrays: 200 x 200 px of {COUNT} frames"
     return [
-        ratio_at_most(1.3, side_by_side(what, "s", "read and zstd alone", own, peer)),
-        at_most(300, Figure(what, "MB", max(memory), "more than with the packages loaded")),
-        at_most(200, Figure(f"arrays: to_xarray, camera, {COUNT} frames", "ms", sorted(opened)[len(opened) // 2])),
+        set_upper_ratio_goal(1.3, compare(what, "s", "read and zstd alone", own, peer)),
+        set_upper_goal(300, Figure(what, "MB", max(memory), "more than with the packages loaded")),
+        set_upper_goal(
+            200, Figure(f"arrays: to_xarray, camera, {COUNT} frames", "ms", sorted(opened)[len(opened) // 2])
+        ),
     ]
 
 
 def _write(session: Path) -> None:
     folder = session / FRAMES
     folder.mkdir(parents=True)
-    form = SeriesForm(folder.name, CAMERA_TOPICS, CompressionType.ZSTD, METADATA, ATTACHMENTS, 10**9, 600 * NS_PER_S)
+    form = SeriesSpec(folder.name, CAMERA_TOPICS, CompressionType.ZSTD, METADATA, ATTACHMENTS, 10**9, 600 * NS_PER_S)
     series = Series(folder, form)
     noise = np.random.default_rng(1).normal(120, 3, (HEIGHT_px + 100, WIDTH_px)).astype(np.uint8)
     for number in range(COUNT):
         time_ns = START_NS + number * FRAME_PERIOD_NS
         image = noise[number % 100 :][:HEIGHT_px]
-        series.commit(stored(Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, number, time_ns)), time_ns)
+        series.commit(
+            make_frame_records(Frame("camera.image", image, time_ns, 0.1, 0.0, 40.0, number, time_ns)), time_ns
+        )
     series.finish()
     write_telemetry(session, COUNT // 2)
 
@@ -103,11 +107,11 @@ def _chunks(path: Path) -> dict[str, float]:
     begin_s = time.perf_counter()
     count = 0
     for segment in session.frame_segments:
-        for place in frame_places(segment):
+        for place in list_frame_places(segment):
             with segment.open("rb", buffering=0) as file:
                 file.seek(place.chunk.offset)
                 content = memoryview(file.read(place.chunk.length))[RECORD.size :]
-            head = chunk_head(content, len(content))
+            head = parse_chunk_head(content, len(content))
             count += len(zstandard.ZstdDecompressor().decompress(content[head.begin :], head.size_bytes)) > 0
     assert count == COUNT
     return {"s": time.perf_counter() - begin_s}

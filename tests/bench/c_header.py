@@ -6,7 +6,7 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side, skipped
+from tests.bench.figures import Figure, compare, make_absolute, make_skipped, report_progress, set_upper_goal
 from tests.compensation.compiled_header import COMPILER
 from tests.compensation.made_up_models import paper, thermal
 from thermostand.compensation.apply.runtime_export import export_c
@@ -20,22 +20,22 @@ _PROGRAM = Path(__file__).with_name("c_header.c")
 def figures(directory: Path) -> list[Figure]:
     """ns per point and sample, ms per map; the best of 25 rounds."""
     if COMPILER is None:
-        return [skipped("a point corrected in C", "no C compiler here")]
+        return [make_skipped("a point corrected in C", "no C compiler here")]
     found: list[Figure] = []
     for model in (thermal(), paper(4)):
-        progress(f"C header, {model.form} form")
-        point_ns, strips_ms, map_ms, memory_ms, sample_ns = _measured(model, directory)
+        report_progress(f"C header, {model.form} form")
+        point_ns, strips_ms, map_ms, memory_ms, sample_ns = _measure(model, directory)
         name = f"C header, {model.form} form"
         found += [
-            at_most(1000, absolute(f"{name}: a point with its flags", "ns", [point_ns])),
-            at_most(2, absolute("  maps of 5 MP, in strips of 32 rows", "ms", [strips_ms])),
-            side_by_side("  maps of 5 MP, whole: 40 MB", "ms", "memset of 40 MB", [map_ms], [memory_ms]),
-            absolute("  a sample of the thermal state", "ns", [sample_ns]),
+            set_upper_goal(1000, make_absolute(f"{name}: a point with its flags", "ns", [point_ns])),
+            set_upper_goal(2, make_absolute("  maps of 5 MP, in strips of 32 rows", "ms", [strips_ms])),
+            compare("  maps of 5 MP, whole: 40 MB", "ms", "memset of 40 MB", [map_ms], [memory_ms]),
+            make_absolute("  a sample of the thermal state", "ns", [sample_ns]),
         ]
     return found
 
 
-def _measured(model: ThermalModel | PaperModel, directory: Path) -> list[float]:
+def _measure(model: ThermalModel | PaperModel, directory: Path) -> list[float]:
     folder = directory / model.form
     folder.mkdir()
     export_c(replace(model, facts=replace(model.facts, image_size=SIZE)), folder / "drift.h")

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, progress, require_aravis, side_by_side
+from tests.bench.figures import Figure, compare, report_progress, require_aravis
 from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera, HEIGHT_px, WIDTH_px
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
@@ -40,17 +40,17 @@ def figures(directory: Path) -> list[Figure]:
     """One figure for each pace."""
     what = "camera, software trigger, 5 MP"
     require_aravis()
-    return [_at_pace(what, pace_MBps) for pace_MBps in PACES_MBps]
+    return [_measure_at_pace(what, pace_MBps) for pace_MBps in PACES_MBps]
 
 
-def _at_pace(what: str, pace_MBps: int) -> Figure:
-    progress(f"{what} at {pace_MBps} MB/s")
+def _measure_at_pace(what: str, pace_MBps: int) -> Figure:
+    report_progress(f"{what} at {pace_MBps} MB/s")
     settings = GigeCameraSettings(
         address=ADDRESS, serial_number=SERIAL_NUMBER, exposure_s=0.001, packet_size=PACKET_SIZE
     )
-    with _fake(pace_MBps):
+    with _run_fake(pace_MBps):
         own, limit = asyncio.run(_measure(AravisCamera("camera", settings, WallClock()), pace_MBps))
-    return side_by_side(what, "frames/s", f"wire paced at {pace_MBps} MB/s", own, limit)
+    return compare(what, "frames/s", f"wire paced at {pace_MBps} MB/s", own, limit)
 
 
 async def _measure(camera: AravisCamera, pace_MBps: int) -> tuple[list[float], list[float]]:
@@ -58,13 +58,13 @@ async def _measure(camera: AravisCamera, pace_MBps: int) -> tuple[list[float], l
     try:
         packets = math.ceil(camera.effective.payload_bytes / (PACKET_SIZE - HEADERS_bytes)) + LEADER_AND_TRAILER
         await camera.grab()
-        own = [await _frames_per_second(camera) for _ in range(ROUNDS)]
+        own = [await _measure_frames_per_second(camera) for _ in range(ROUNDS)]
     finally:
         await camera.close()
     return own, [pace_MBps * 1e6 / (packets * PACKET_SIZE)] * ROUNDS
 
 
-async def _frames_per_second(camera: AravisCamera) -> float:
+async def _measure_frames_per_second(camera: AravisCamera) -> float:
     begin_s = time.perf_counter()
     for _ in range(FRAMES):
         await camera.grab()
@@ -72,7 +72,7 @@ async def _frames_per_second(camera: AravisCamera) -> float:
 
 
 @contextmanager
-def _fake(pace_MBps: int) -> Generator[None]:
+def _run_fake(pace_MBps: int) -> Generator[None]:
     """The camera, in a process of its own, until the block ends."""
     command = [sys.executable, "-m", "tests.bench.camera", str(pace_MBps)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:

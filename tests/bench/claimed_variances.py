@@ -13,21 +13,21 @@ from statistics import mean
 import cv2
 import numpy as np
 
-from tests.bench.figures import Figure, absolute, at_most, progress
-from tests.compensation.rendered import Float, Scene, render, true_centres_px
-from tests.compensation.spoiled import (
+from tests.bench.figures import Figure, make_absolute, report_progress, set_upper_goal
+from tests.compensation.degraded_images import (
     Picture,
-    as_jpeg,
-    flickering_rows,
-    moved_while_exposed,
-    noise_alone,
-    on_grained_paper,
-    unequal_pixels,
-    with_gamma,
+    make_jpeg_picture,
+    make_motion_blur_picture,
+    photograph_flickering_rows,
+    photograph_grained_paper,
+    photograph_unequal_pixels,
+    photograph_with_gamma,
+    photograph_with_noise,
 )
+from tests.compensation.renderer import Float, Scene, compute_true_centres_px, render
 from thermostand.markers.detection import Detection, detect
 from thermostand.markers.target import load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 FRAMES = 24
 CLEAN_FRAMES = 100
@@ -39,13 +39,13 @@ SCENES = {
     "10 px": Scene(size=(1224, 1024), f_px=2700, roll_deg=12, tilt_y_deg=-20, distance_mm=1080),
 }
 PICTURES: dict[str, Picture] = {
-    "noise alone": noise_alone,
-    **{f"JPEG {quality}": as_jpeg(quality) for quality in (95, 90, 80)},
-    **{f"motion of {length} px": moved_while_exposed(length, 110) for length in (2, 4, 6, 8)},
-    "unequal pixels, 2 %": unequal_pixels,
-    "gamma 2.2": with_gamma,
-    "flickering rows, 3 DN": flickering_rows,
-    "grained paper": on_grained_paper,
+    "noise alone": photograph_with_noise,
+    **{f"JPEG {quality}": make_jpeg_picture(quality) for quality in (95, 90, 80)},
+    **{f"motion of {length} px": make_motion_blur_picture(length, 110) for length in (2, 4, 6, 8)},
+    "unequal pixels, 2 %": photograph_unequal_pixels,
+    "gamma 2.2": photograph_with_gamma,
+    "flickering rows, 3 DN": photograph_flickering_rows,
+    "grained paper": photograph_grained_paper,
 }
 
 
@@ -54,39 +54,45 @@ def figures(directory: Path) -> list[Figure]:
     cv2.setNumThreads(1)
     lines: list[Figure] = []
     for size, scene in SCENES.items():
-        progress(f"claimed variances, discs of {size}")
+        report_progress(f"claimed variances, discs of {size}")
         clean = render(scene)
         for name, picture in PICTURES.items():
-            lines.append(_figure(f"{name}, discs of {size}", scene, clean, picture))
+            lines.append(_make_figure(f"{name}, discs of {size}", scene, clean, picture))
         for blur in (0.6, 2.5):
             blurred = replace(scene, psf_px=blur)
-            lines.append(_figure(f"blur {blur} px, discs of {size}", blurred, render(blurred), noise_alone))
-    return [*lines, _false_alarms()]
+            lines.append(
+                _make_figure(f"blur {blur} px, discs of {size}", blurred, render(blurred), photograph_with_noise)
+            )
+    return [*lines, _count_false_alarms()]
 
 
-def _false_alarms() -> Figure:
+def _count_false_alarms() -> Figure:
     """Frames of noise alone, none of them in the lines above, that are said to be doubtful."""
-    target = load_target(packaged("targets", "paper-9x6"))
+    target = load_target(find_packaged("targets", "paper-9x6"))
     doubtful: list[bool] = []
     for number, (size, scene) in enumerate(SCENES.items()):
-        progress(f"false alarms, discs of {size}")
+        report_progress(f"false alarms, discs of {size}")
         clean, first = render(scene), FIRST_SEED + 1000 * (number + 1)
-        found = [detect(noise_alone(scene, clean, seed), target) for seed in range(first, first + CLEAN_FRAMES)]
+        found = [
+            detect(photograph_with_noise(scene, clean, seed), target) for seed in range(first, first + CLEAN_FRAMES)
+        ]
         doubtful += [detection.is_doubtful for detection in found]
-    return at_most(_FALSE_ALARMS, absolute(f"doubtful of {len(doubtful)} frames of noise alone", "", [mean(doubtful)]))
+    return set_upper_goal(
+        _FALSE_ALARMS, make_absolute(f"doubtful of {len(doubtful)} frames of noise alone", "", [mean(doubtful)])
+    )
 
 
-def _figure(name: str, scene: Scene, clean: Float, picture: Picture) -> Figure:
-    target = load_target(packaged("targets", "paper-9x6"))
+def _make_figure(name: str, scene: Scene, clean: Float, picture: Picture) -> Figure:
+    target = load_target(find_packaged("targets", "paper-9x6"))
     found = [detect(picture(scene, clean, FIRST_SEED + number), target) for number in range(FRAMES)]
-    chi2 = _chi2(found, true_centres_px(scene))
+    chi2 = _compute_chi2(found, compute_true_centres_px(scene))
     doubtful = sum(detection.is_doubtful for detection in found)
     reported = f" ({doubtful} of {FRAMES} frames doubtful)" if doubtful else ""
-    figure = absolute(f"claimed variances, {name}{reported}", "chi^2", [max(*chi2, *(1 / chi2))])
-    return figure if doubtful > FRAMES / 2 else at_most(GOAL, figure)
+    figure = make_absolute(f"claimed variances, {name}{reported}", "chi^2", [max(*chi2, *(1 / chi2))])
+    return figure if doubtful > FRAMES / 2 else set_upper_goal(GOAL, figure)
 
 
-def _chi2(found: list[Detection], truth: Float) -> Float:
+def _compute_chi2(found: list[Detection], truth: Float) -> Float:
     """Of the unflagged markers, along x and y."""
     squares = np.array(
         [(one.centres_px - truth) ** 2 / np.diagonal(one.covariance_px2, axis1=1, axis2=2) for one in found]

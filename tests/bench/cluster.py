@@ -8,9 +8,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.bench.figures import Figure, absolute, at_most, progress, skipped
-from tests.bench.pipeline import SEQUENCE, photographed, write_session
-from tests.compensation.cluster_week import CAMERAS, week
+from tests.bench.figures import Figure, make_absolute, make_skipped, report_progress, set_upper_goal
+from tests.bench.pipeline import SEQUENCE, render_photograph, write_session
+from tests.compensation.cluster_week import CAMERAS, run_week
 from thermostand.recording.reading.session import Session
 
 FRAMES, PER_PIECE = 48, 16
@@ -21,23 +21,25 @@ WEEK = 4_000_000
 def figures(directory: Path) -> Iterator[Figure]:
     """Processor time of a frame, memory after the first and after the last camera, and what the killed worker cost."""
     try:
-        made = week(_sessions(directory), PER_PIECE)
+        made = run_week(_iterate_sessions(directory), PER_PIECE)
     except ImportError as error:
-        yield skipped("cluster", error)
+        yield make_skipped("cluster", error)
         return
     frame_ms = 1e3 * made.used_s / (FRAMES * (CAMERAS - 1))
-    yield absolute("10 cameras on Dask, a frame of 5 MP, both workers", "CPU ms", [frame_ms])
-    yield absolute("  of 4 million frames, a week", "core-hours", [frame_ms * WEEK / 3.6e6])
-    yield absolute("  memory of a worker after the first camera", "MB", [made.memory_MB[0]])
-    yield at_most(1.1, absolute("  after the last one, over it", "", [made.memory_MB[-1] / made.memory_MB[0]]))
-    yield at_most(2, absolute("  pieces done again for a killed worker", "", [float(made.twice)]))
+    yield make_absolute("10 cameras on Dask, a frame of 5 MP, both workers", "CPU ms", [frame_ms])
+    yield make_absolute("  of 4 million frames, a week", "core-hours", [frame_ms * WEEK / 3.6e6])
+    yield make_absolute("  memory of a worker after the first camera", "MB", [made.memory_MB[0]])
+    yield set_upper_goal(
+        1.1, make_absolute("  after the last one, over it", "", [made.memory_MB[-1] / made.memory_MB[0]])
+    )
+    yield set_upper_goal(2, make_absolute("  pieces done again for a killed worker", "", [float(made.twice)]))
 
 
-def _sessions(directory: Path) -> Iterator[Session]:
+def _iterate_sessions(directory: Path) -> Iterator[Session]:
     """Each is there while it is worked on."""
-    photographs = [photographed(index) for index in range(len(SEQUENCE))]
+    photographs = [render_photograph(index) for index in range(len(SEQUENCE))]
     for camera in range(CAMERAS):
-        progress(f"cluster, camera {camera + 1} of {CAMERAS}")
+        report_progress(f"cluster, camera {camera + 1} of {CAMERAS}")
         folder = directory / f"cluster-{camera}"
         write_session(folder, photographs, FRAMES)
         yield Session.open(folder)

@@ -7,12 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tests.bench.figures import Figure, absolute, at_most, progress, side_by_side
-from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, drawn_camera
-from tests.compensation.drawn_nights import Night, cycle, full_night, night, reference, unseen_begin
-from thermostand.compensation.drift.choosing import FORMS, fit
+from tests.bench.figures import Figure, compare, make_absolute, report_progress, set_upper_goal
+from tests.compensation.drawn_cameras import REPEATING, UNREPEATING, draw_camera
+from tests.compensation.drawn_sessions import (
+    DrawnSession,
+    cycle,
+    make_full_session,
+    make_unseen_begin,
+    record_session,
+    reference,
+)
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.model_selection import FORMS, fit
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.observations import Float
 from thermostand.experiments.steps import Role
 
@@ -33,7 +40,7 @@ class Score:
     covered_unflagged: float
 
 
-def effects_of(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
+def draw_effects(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
     """What this camera has, and how its night begins: with a recorded warm-up, with switching it on, or after that."""
     rng = np.random.default_rng([18, seed])
     names = [name for name in REPEATING if rng.random() < _CHANCE]
@@ -42,19 +49,21 @@ def effects_of(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
     return (*names, one) if unrepeating else tuple(names), begin
 
 
-def drawn_night(seed: int, *, unrepeating: bool) -> Night:
-    names, begin = effects_of(seed, unrepeating=unrepeating)
-    unrecorded = unseen_begin() if begin == "unseen" else []
-    parts = [*reference(), *cycle()] if begin == "unseen" else full_night(with_warm_up=begin == "warm up")
-    return night(drawn_camera(seed, *names), parts, seed, unrecorded=unrecorded)
+def record_drawn_session(seed: int, *, unrepeating: bool) -> DrawnSession:
+    names, begin = draw_effects(seed, unrepeating=unrepeating)
+    unrecorded = make_unseen_begin() if begin == "unseen" else []
+    parts = [*reference(), *cycle()] if begin == "unseen" else make_full_session(with_warm_up=begin == "warm up")
+    return record_session(draw_camera(seed, *names), parts, seed, unrecorded=unrecorded)
 
 
-def score(model: DriftModel, made: Night, role: str = Role.VALIDATION, reference_px: Float | None = None) -> Score:
+def score(
+    model: DriftModel, made: DrawnSession, role: str = Role.VALIDATION, reference_px: Float | None = None
+) -> Score:
     """Of the deviations from the truth's own reference, unless another is given, without the noise of single frames."""
     observed, truth = made.observed, made.truth_px
     if reference_px is None:
         reference_px = truth[observed.of(Role.REFERENCE)].mean(axis=0)
-    states = frame_states(observed, model.memory)
+    states = compute_frame_states(observed, model.memory)
     model = model.of_sessions(one.session_id for one in observed.sessions)
     left, claimed, flags = [], [], []
     for frame in np.flatnonzero(observed.of(role)).tolist():
@@ -72,25 +81,25 @@ def score(model: DriftModel, made: Night, role: str = Role.VALIDATION, reference
 def figures() -> Iterator[Figure]:
     """Medians and worst of 20 cameras, per form, with and without what does not repeat."""
     for group, goal_mpx in GOAL_MPX.items():
-        progress(f"drift, {CAMERAS} drawn cameras, {group}")
+        report_progress(f"drift, {CAMERAS} drawn cameras, {group}")
         scores: dict[str, list[Score]] = {form: [] for form in (*FORMS, "chosen")}
         for seed in range(CAMERAS):
-            made = drawn_night(seed, unrepeating=group != "repeating")
+            made = record_drawn_session(seed, unrepeating=group != "repeating")
             chosen = fit(made.observed)
             for model in (chosen, chosen.other):
                 if model is not None:
                     scores[model.form].append(score(model, made))
             scores["chosen"].append(scores[chosen.form][-1])
-        yield from _table(group, goal_mpx, scores)
+        yield from _list_scores(group, goal_mpx, scores)
 
 
-def _table(group: str, goal_mpx: float, scores: dict[str, list[Score]]) -> Iterator[Figure]:
+def _list_scores(group: str, goal_mpx: float, scores: dict[str, list[Score]]) -> Iterator[Figure]:
     paper = [one.rms_mpx for one in scores["paper"]]
     for form in ("thermal", "chosen"):
         values = [one.rms_mpx for one in scores[form]]
-        median = side_by_side(f"drift, drawn cameras, {group}, {form} form", "mpx RMS", "paper's form", values, paper)
-        yield at_most(goal_mpx, median) if form == "chosen" else median
-        yield absolute("  the worst camera", "mpx RMS", [max(values)])
+        median = compare(f"drift, drawn cameras, {group}, {form} form", "mpx RMS", "paper's form", values, paper)
+        yield set_upper_goal(goal_mpx, median) if form == "chosen" else median
+        yield make_absolute("  the worst camera", "mpx RMS", [max(values)])
     for form in FORMS:
         share = 100 * float(np.mean([one.covered for one in scores[form]]))
-        yield absolute(f"  95 % interval, {form} form; 92 to 98 is right", "%", [share])
+        yield make_absolute(f"  95 % interval, {form} form; 92 to 98 is right", "%", [share])

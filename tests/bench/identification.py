@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.bench.figures import Figure, at_least, progress
-from tests.compensation.identified import SCENES, TARGETS, Image, judged, own, posed
-from tests.compensation.rendered import Float, Scene, photograph, render
+from tests.bench.figures import Figure, report_progress, set_lower_goal
+from tests.compensation.identification_scenes import SCENES, TARGETS, Image, draw_pose, find_own_centres, judge
+from tests.compensation.renderer import Float, Scene, photograph, render
 from thermostand.markers.target import Target, load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 POSES = 10
 POSES_OF_TARGETS = 5
@@ -27,21 +27,23 @@ Finder = Callable[[Image, Target], Float | None]
 """Image, target -> centres (N, 2), NaN for markers not found; None for a refusal."""
 
 
-def circles_grid(tuned: bool, clustering: bool) -> Finder:
+def make_circles_grid_finder(tuned: bool, clustering: bool) -> Finder:
     """The peer, with OpenCV's default blob detector or one for these discs, and either way of finding the grid."""
 
     def found(image: Image, target: Target) -> Float | None:
         flags = cv2.CALIB_CB_ASYMMETRIC_GRID if target.layout == "staggered" else cv2.CALIB_CB_SYMMETRIC_GRID
         flags |= cv2.CALIB_CB_CLUSTERING if clustering else 0
         size = (target.columns, target.rows)
-        blobs = cv2.SimpleBlobDetector.create(_tuned(target)) if tuned else cv2.SimpleBlobDetector.create()
+        blobs = (
+            cv2.SimpleBlobDetector.create(_make_tuned_parameters(target)) if tuned else cv2.SimpleBlobDetector.create()
+        )
         success, centres = cv2.findCirclesGrid(image, size, flags=flags, blobDetector=blobs)
         return centres.reshape(-1, 2).astype(np.float64) if success else None
 
     return found
 
 
-def _tuned(target: Target) -> cv2.SimpleBlobDetector.Params:
+def _make_tuned_parameters(target: Target) -> cv2.SimpleBlobDetector.Params:
     blobs = cv2.SimpleBlobDetector.Params()
     blobs.minArea, blobs.maxArea, blobs.minDistBetweenBlobs = 20, 2e5, 4
     blobs.minThreshold, blobs.maxThreshold, blobs.thresholdStep = 40, 180, 20
@@ -51,35 +53,37 @@ def _tuned(target: Target) -> cv2.SimpleBlobDetector.Params:
 
 
 PEERS: dict[str, Finder] = {
-    "default": circles_grid(tuned=False, clustering=False),
-    "tuned": circles_grid(tuned=True, clustering=False),
-    "clustering": circles_grid(tuned=True, clustering=True),
+    "default": make_circles_grid_finder(tuned=False, clustering=False),
+    "tuned": make_circles_grid_finder(tuned=True, clustering=False),
+    "clustering": make_circles_grid_finder(tuned=True, clustering=True),
 }
 
 
 def figures(directory: Path) -> list[Figure]:
     """Of ten poses of each scene, how many are identified, own beside the peer's three settings."""
-    paper = load_target(packaged("targets", "paper-9x6"))
-    rows = [_row(name, [posed(name, seed) for seed in range(POSES)], paper) for name in SCENES]
+    paper = load_target(find_packaged("targets", "paper-9x6"))
+    rows = [_score_row(name, [draw_pose(name, seed) for seed in range(POSES)], paper) for name in SCENES]
     for name, (target, scene) in TARGETS.items():
-        rows.append(_row(name, [posed(name, seed, {name: scene}) for seed in range(POSES_OF_TARGETS)], target))
+        rows.append(
+            _score_row(name, [draw_pose(name, seed, {name: scene}) for seed in range(POSES_OF_TARGETS)], target)
+        )
     return rows
 
 
-def _row(name: str, scenes: list[Scene], target: Target) -> Figure:
-    progress(f"identification, {name}")
+def _score_row(name: str, scenes: list[Scene], target: Target) -> Figure:
+    report_progress(f"identification, {name}")
     verdicts: dict[str, list[str]] = {"own": [], **{peer: [] for peer in PEERS}}
     for seed, scene in enumerate(scenes):
         image = photograph(scene, render(scene), seed)
-        verdicts["own"].append(judged(own(image, target), scene, own_order=True))
+        verdicts["own"].append(judge(find_own_centres(image, target), scene, own_order=True))
         for peer, finder in PEERS.items() if target.count <= PEERS_MOST_MARKERS else ():
-            verdicts[peer].append(judged(finder(image, target), scene, own_order=False))
-    peers = ", ".join(f"{peer} {_score(verdicts[peer])}" for peer in PEERS if verdicts[peer]) or "not run"
+            verdicts[peer].append(judge(finder(image, target), scene, own_order=False))
+    peers = ", ".join(f"{peer} {_format_score(verdicts[peer])}" for peer in PEERS if verdicts[peer]) or "not run"
     found, wrong = verdicts["own"].count("found"), verdicts["own"].count("wrong")
     row = Figure(f"identified, {name}", f"of {len(scenes)}, {wrong} wrong", found, f"cv2.findCirclesGrid: {peers}")
-    return at_least(len(scenes), row)
+    return set_lower_goal(len(scenes), row)
 
 
-def _score(verdicts: list[str]) -> str:
+def _format_score(verdicts: list[str]) -> str:
     wrong = verdicts.count("wrong")
     return f"{verdicts.count('found')}" + (f" ({wrong} wrong)" if wrong else "")

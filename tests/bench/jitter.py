@@ -16,17 +16,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-from tests.bench.figures import Figure, at_most, progress, require_aravis, skipped
-from tests.bench.waiting import beside, p99, waiting
+from tests.bench.figures import Figure, make_skipped, report_progress, require_aravis, set_upper_goal
+from tests.bench.waiting import compare_with_waiting, compute_p99, run_waiting_process
 from tests.system.simulated_orders import simulated_order
 from thermostand.drivers.wires.camera_connection import Connection, Shot
-from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.clock import WallClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_real
-from thermostand.stand.simulator import Simulator, laboratory_of
+from thermostand.stand.simulator import Simulator, describe_laboratory
 
 FRAMES = 101  # so that the 99th percentile is not the longest
 INTERVAL_s = 0.5
@@ -47,17 +47,17 @@ def figures(directory: Path) -> list[Figure]:
     """99th percentile of the deviation from the grid, ms."""
     what = f"frame schedule at {1 / INTERVAL_s:g} fps, deviation"
     require_aravis()
-    progress(f"{FRAMES} frames in real time")
+    report_progress(f"{FRAMES} frames in real time")
     order = simulated_order(directory, RECIPE, poll_s=1.0)
-    with laboratory(order):
-        late_ms, bare_ms = deviations_ms(order, directory / "jitter")
-    return [schedule(what, late_ms, bare_ms)]
+    with run_laboratory(order):
+        late_ms, bare_ms = measure_deviations_ms(order, directory / "jitter")
+    return [make_schedule_figure(what, late_ms, bare_ms)]
 
 
 @contextmanager
-def laboratory(order: Order) -> Generator[None]:
+def run_laboratory(order: Order) -> Generator[None]:
     """The simulated one of the order, in real time; its camera renders one picture and shows it from then on."""
-    described = laboratory_of(order.config, virtual=False, seed=None)
+    described = describe_laboratory(order.config, virtual=False, seed=None)
     devices = cast("dict[str, dict[str, Any]]", described["devices"])
     for device in devices.values():
         if device["fake"] == "cameras":
@@ -69,21 +69,21 @@ def laboratory(order: Order) -> Generator[None]:
         simulator.stop()
 
 
-def schedule(what: str, late_ms: Sequence[float], bare_ms: Sequence[float], more: str = "") -> Figure:
+def make_schedule_figure(what: str, late_ms: Sequence[float], bare_ms: Sequence[float], more: str = "") -> Figure:
     """99th percentile of these deviations, and of how many of all frames they are."""
     busy = FRAMES - len(late_ms)
     if busy > FRAMES // 2:
-        return skipped(what, f"{busy} of {FRAMES} frames came due while the camera was sending")
+        return make_skipped(what, f"{busy} of {FRAMES} frames came due while the camera was sending")
     seen = f"p99 of {len(late_ms)} frames; median {statistics.median(late_ms):.2f}, greatest {max(late_ms):.2f} ms"
     seen += f"; {busy} more came due while the camera was sending{more}"
-    return at_most(LIMIT_ms, beside(Figure(what, "ms", p99(late_ms), seen), bare_ms))
+    return set_upper_goal(LIMIT_ms, compare_with_waiting(Figure(what, "ms", compute_p99(late_ms), seen), bare_ms))
 
 
-async def _nobody(_: Path) -> None:
+async def _ignore_session(_: Path) -> None:
     pass
 
 
-def deviations_ms(
+def measure_deviations_ms(
     order: Order, out: Path, begun: Callable[[Path], Awaitable[None]] | None = None
 ) -> tuple[list[float], list[float]]:
     """How late each frame of the first capture was triggered whose camera was free in time, and how late a process is
@@ -94,21 +94,21 @@ def deviations_ms(
 
     def follow(item: Item) -> None:
         if isinstance(item, Frame) and len(triggered_ns) < FRAMES:
-            triggered_ns.append(item.time_ns - seconds_ns(item.exposure_s / 2))
+            triggered_ns.append(item.time_ns - to_ns(item.exposure_s / 2))
             arrived_ns.append(clock.now_ns())
 
     def watch(hub: Hub) -> None:
         hub.subscribe(follow)
 
-    with _noted_dues() as dues_ns, waiting(INTERVAL_s) as bare_ms:
-        asyncio.run(run_real(order, out, watch, begun or _nobody))
+    with _record_due_times() as dues_ns, run_waiting_process(INTERVAL_s) as bare_ms:
+        asyncio.run(run_real(order, out, watch, begun or _ignore_session))
     shutil.rmtree(out)
     frames = zip(triggered_ns, dues_ns, [0, *arrived_ns], strict=False)
     return [(time_ns - due) / 1e6 for time_ns, due, free in frames if free <= due - clock.lead_ns], bare_ms
 
 
 @contextmanager
-def _noted_dues() -> Generator[list[int]]:
+def _record_due_times() -> Generator[list[int]]:
     """When each frame of the capture is due on the stand's clock, in the order in which they are triggered."""
     dues_ns: list[int] = []
     trigger = Connection.trigger

@@ -22,7 +22,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, absolute, at_least, at_most, in_turns, progress, ratio_at_least, side_by_side
+from tests.bench.figures import (
+    Figure,
+    compare,
+    make_absolute,
+    measure_in_turns,
+    report_progress,
+    set_lower_goal,
+    set_lower_ratio_goal,
+    set_upper_goal,
+)
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Frame
@@ -41,19 +50,19 @@ INFO = SessionInfo("bench", "bench", "", "", "0", "wall")
 
 def figures(directory: Path) -> list[Figure]:
     """MB/s, frames dropped, the event loop's lag and peak memory at line rate; MB/s beside bare writes."""
-    progress(f"recorder, {DURATION_S:.0f} s at line rate")
+    report_progress(f"recorder, {DURATION_S:.0f} s at line rate")
     command = [sys.executable, "-m", "tests.bench.line_rate", str(directory)]
     found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
     return [
-        at_least(
+        set_lower_goal(
             117.9,
-            side_by_side("recorder, raw at line rate", "MB/s", "offered", [found["MB_s"]], [found["offered_MB_s"]]),
+            compare("recorder, raw at line rate", "MB/s", "offered", [found["MB_s"]], [found["offered_MB_s"]]),
         ),
-        at_most(0, absolute("recorder at line rate, dropped", "frames", [found["dropped"]])),
-        at_most(PEAK_LIMIT_MB, absolute("recorder at line rate, peak memory", "MB", [found["peak_MB"]])),
-        absolute("recorder at line rate, loop lag p99", "ms", [found["lag_p99_ms"]]),
-        ratio_at_least(
-            0.5, side_by_side("recorder, raw as fast as it goes", "MB/s", "bare pwrite, fdatasync", *found["free_MB_s"])
+        set_upper_goal(0, make_absolute("recorder at line rate, dropped", "frames", [found["dropped"]])),
+        set_upper_goal(PEAK_LIMIT_MB, make_absolute("recorder at line rate, peak memory", "MB", [found["peak_MB"]])),
+        make_absolute("recorder at line rate, loop lag p99", "ms", [found["lag_p99_ms"]]),
+        set_lower_ratio_goal(
+            0.5, compare("recorder, raw as fast as it goes", "MB/s", "bare pwrite, fdatasync", *found["free_MB_s"])
         ),
     ]
 
@@ -98,7 +107,7 @@ class Recording:
             await self._clock.sleep_until(begin_ns + round(number * FRAME_MB / LINE_RATE_MB_S * NS_PER_S))
             self.publish(IMAGES[number % len(IMAGES)].copy())
         offered_s = (self._clock.now_ns() - begin_ns) / NS_PER_S
-        await self.recorder.flushed()
+        await self.recorder.flush()
         duration_s = (self._clock.now_ns() - begin_ns) / NS_PER_S
         pulse.cancel()
         return {
@@ -121,7 +130,7 @@ class Recording:
         begin_s = time.perf_counter()
         for number in range(FRAMES):
             self.publish(IMAGES[number % len(IMAGES)])
-        await self.recorder.flushed()
+        await self.recorder.flush()
         return FRAMES * FRAME_MB / (time.perf_counter() - begin_s)
 
 
@@ -155,7 +164,7 @@ def main(directory: Path) -> None:
         runner.run(free.begin())
         bare = directory / "bare"
         file = os.open(bare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        found["free_MB_s"] = in_turns(lambda: runner.run(free.as_fast_as_it_goes()), bare_writer(file), ROUNDS)
+        found["free_MB_s"] = measure_in_turns(lambda: runner.run(free.as_fast_as_it_goes()), bare_writer(file), ROUNDS)
         os.close(file)
         bare.unlink()
         runner.run(free.end())

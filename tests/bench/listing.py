@@ -7,7 +7,15 @@ import resource
 import shutil
 from pathlib import Path
 
-from tests.bench.figures import Figure, Measurement, absolute, at_most, in_turns, process_ms, side_by_side
+from tests.bench.figures import (
+    Figure,
+    Measurement,
+    compare,
+    make_absolute,
+    measure_in_turns,
+    measure_process_ms,
+    set_upper_goal,
+)
 from tests.recording.runs import record_run
 
 SESSIONS = 1000
@@ -16,7 +24,7 @@ MOST_MS = 300.0
 PEER = "stand session list of an empty folder"
 
 
-def sessions(folder: Path, count: int = SESSIONS) -> Path:
+def copy_sessions(folder: Path, count: int = SESSIONS) -> Path:
     """That many copies of a small session of 11 segments."""
     folder.mkdir(parents=True)
     asyncio.run(record_run(folder / "0000"))
@@ -25,22 +33,22 @@ def sessions(folder: Path, count: int = SESSIONS) -> Path:
     return folder
 
 
-def listed(folder: Path) -> Measurement:
+def make_listing_measurement(folder: Path) -> Measurement:
     """ms of the command."""
-    return lambda: process_ms("-m", "thermostand.stand.cli", "session", "list", folder)
+    return lambda: measure_process_ms("-m", "thermostand.stand.cli", "session", "list", folder)
 
 
 def figures(folder: Path) -> list[Figure]:
     """The first list makes the index; then what it takes beside a list of nothing."""
-    many = sessions(folder / "listing")
+    many = copy_sessions(folder / "listing")
     empty = folder / "no-sessions"
     empty.mkdir()
-    first = absolute(f"first list of {SESSIONS} sessions", "ms", [listed(many)()])
+    first = make_absolute(f"first list of {SESSIONS} sessions", "ms", [make_listing_measurement(many)()])
     began_s = _children_s()
-    ours, others = in_turns(listed(many), listed(empty), ROUNDS)
+    ours, others = measure_in_turns(make_listing_measurement(many), make_listing_measurement(empty), ROUNDS)
     used_s = (_children_s() - began_s) / (ROUNDS + 1)
     peer = f"{PEER}; processor time of both {1e3 * used_s:.0f} ms, of what they took {sum(ours + others) / ROUNDS:.0f}"
-    return [first, at_most(MOST_MS, side_by_side(f"list of {SESSIONS} sessions", "ms", peer, ours, others))]
+    return [first, set_upper_goal(MOST_MS, compare(f"list of {SESSIONS} sessions", "ms", peer, ours, others))]
 
 
 def _children_s() -> float:

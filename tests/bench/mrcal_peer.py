@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tests.bench.figures import Figure, progress, side_by_side, skipped
+from tests.bench.figures import Figure, compare, make_skipped, report_progress
 from tests.compensation.calibration_truth import SIZE, CENTRE_mm, Truth, board, draw, positions, translation_errors_um
-from thermostand.compensation.calibration.adjustment import adjust, table_from_poses
-from thermostand.compensation.calibration.board import shifts_by_homography
+from thermostand.compensation.calibration.adjustment import adjust, fit_table
+from thermostand.compensation.calibration.board import compute_homography_shifts
 from thermostand.compensation.calibration.pinhole import Pinhole, calibrate_opencv
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 
@@ -36,12 +36,12 @@ Float = NDArray[np.float64]
 def figures() -> list[Figure]:
     """Translations of V0..V3, um RMS over six laboratories with an exact print; one skipped line without mrcal."""
     if not is_installed():
-        return [skipped("calibration, mrcal", f"{PYTHON} has no mrcal (Debian: python3-mrcal)")]
-    progress("calibration, mrcal")
+        return [make_skipped("calibration, mrcal", f"{PYTHON} has no mrcal (Debian: python3-mrcal)")]
+    report_progress("calibration, mrcal")
     pairs = [_errors_um(seed) for seed in SEEDS]
     ours, theirs = (_rms([pair[which] for pair in pairs]) for which in (0, 1))
     return [
-        side_by_side(f"calibration, V0..V3 along {axis}, exact print", "um RMS", PEER, [own], [other])
+        compare(f"calibration, V0..V3 along {axis}, exact print", "um RMS", PEER, [own], [other])
         for axis, own, other in zip("XYZ", ours, theirs, strict=True)
     ]
 
@@ -60,9 +60,9 @@ def _errors_um(seed: int) -> tuple[Float, Float]:
     seen, known = positions(laboratory), board(laboratory, measured=False)
     own = adjust(seen, known, TABLE)
     ours = translation_errors_um(laboratory, own.scene.lens, own.adjusted_board, own.scene.table)
-    shifts = [shifts_by_homography(centres, known.points_mm, known.diameters_mm) for centres in seen.centres_px]
+    shifts = [compute_homography_shifts(centres, known.points_mm, known.diameters_mm) for centres in seen.centres_px]
     lens, rotations, translations_mm = calibrated(seen.centres_px - np.array(shifts), known.points_mm)
-    table = table_from_poses(seen.linear_mm, seen.rotary_deg, rotations, translations_mm, CENTRE_mm)
+    table = fit_table(seen.linear_mm, seen.rotary_deg, rotations, translations_mm, CENTRE_mm)
     return ours, translation_errors_um(laboratory, lens, known, table)
 
 

@@ -17,10 +17,10 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
-from tests.bench.figures import Figure, at_most, progress, skipped
-from tests.bench.waiting import beside, p99, waiting
+from tests.bench.figures import Figure, make_skipped, report_progress, set_upper_goal
+from tests.bench.waiting import compare_with_waiting, compute_p99, run_waiting_process
 from tests.stand.browser import CHROMIUM, a_page, browser
-from tests.stand.page_desk import NightDesk, a_night, frame_of, free_port, target_image
+from tests.stand.page_service import CycleService, frame_of, free_port, serve_cycle, target_image
 from thermostand.foundation.clock import NS_PER_S
 
 DAY_S = 24 * 3600
@@ -38,18 +38,18 @@ CHANNELS = (
 def figures(directory: Path) -> list[Figure]:
     """Heap of the page, MB; answers of the curves, ms; two viewers, % of a core."""
     if not CHROMIUM:
-        return [skipped("the page", RuntimeError("no chromium is installed"))]
+        return [make_skipped("the page", RuntimeError("no chromium is installed"))]
     return asyncio.run(_figures(directory))
 
 
 async def _figures(directory: Path) -> list[Figure]:
     port = free_port()
-    async with a_night(directory / "sessions", port) as desk, browser() as chromium:
-        return [*await _lived_through(desk, chromium, port), await _viewers(desk, chromium, port)]
+    async with serve_cycle(directory / "sessions", port) as desk, browser() as chromium:
+        return [*await _measure_long_page(desk, chromium, port), await _measure_viewers(desk, chromium, port)]
 
 
-async def _lived_through(desk: NightDesk, chromium: Any, port: int) -> list[Figure]:
-    progress("a page open for 24 h of a replayed night")
+async def _measure_long_page(desk: CycleService, chromium: Any, port: int) -> list[Figure]:
+    report_progress("a page open for 24 h of a replayed night")
     async with a_page(chromium, port) as page:
         await page.get_by_role("button", name="24 h").click()
         await page.wait_for_timeout(3000)
@@ -67,16 +67,18 @@ async def _lived_through(desk: NightDesk, chromium: Any, port: int) -> list[Figu
                 seen_MB.append(await _heap_MB(page))
         await page.wait_for_timeout(3000)
         seen_MB.append(await _heap_MB(page))
-    with waiting() as waited_ms:
-        answers_ms = await asyncio.to_thread(_answers_ms, port, desk)
+    with run_waiting_process() as waited_ms:
+        answers_ms = await asyncio.to_thread(_measure_answers_ms, port, desk)
     peer = f"{before_MB:.1f} MB at first, {seen_MB[-1]:.1f} MB at the end"
     reported = f"p99 of {ASKED}; median {statistics.median(answers_ms):.1f} ms"
     return [
-        at_most(100, Figure("page open for 24 h of a night, heap in use at most", "MB", max(seen_MB), peer)),
-        at_most(
+        set_upper_goal(100, Figure("page open for 24 h of a night, heap in use at most", "MB", max(seen_MB), peer)),
+        set_upper_goal(
             50,
-            beside(
-                Figure("curves of 24 h in 1200 columns, 12 channels, answered", "ms", p99(answers_ms), reported),
+            compare_with_waiting(
+                Figure(
+                    "curves of 24 h in 1200 columns, 12 channels, answered", "ms", compute_p99(answers_ms), reported
+                ),
                 waited_ms,
             ),
         ),
@@ -93,7 +95,7 @@ async def _heap_MB(page: Any) -> float:
         await session.detach()
 
 
-def _answers_ms(port: int, desk: NightDesk) -> list[float]:
+def _measure_answers_ms(port: int, desk: CycleService) -> list[float]:
     to_ns = desk.clock.now_ns()
     query = f"from_ns={to_ns - DAY_S * NS_PER_S}&to_ns={to_ns}&points=1200&channels={CHANNELS}"
     found_ms: list[float] = []
@@ -105,8 +107,8 @@ def _answers_ms(port: int, desk: NightDesk) -> list[float]:
     return found_ms
 
 
-async def _viewers(desk: NightDesk, chromium: Any, port: int) -> Figure:
-    progress("two viewers of two frames a second")
+async def _measure_viewers(desk: CycleService, chromium: Any, port: int) -> Figure:
+    report_progress("two viewers of two frames a second")
     images = [target_image(0.05 * index, 0, (2448, 2048)) for index in range(4)]
     desk.hub.publish(frame_of(images[0], desk.clock.now_ns()))
     while desk.viewing is None or not desk.viewing.previews:
@@ -127,7 +129,7 @@ async def _viewers(desk: NightDesk, chromium: Any, port: int) -> Figure:
         await asyncio.sleep(2)
         watched = await _load_percent(frames)
     peer = f"{watched:.1f} % with them, {alone:.1f} % without (frames handed to the other process)"
-    return at_most(5, Figure("two viewers at 2 fps, of one core", "%", max(0.0, watched - alone), peer))
+    return set_upper_goal(5, Figure("two viewers at 2 fps, of one core", "%", max(0.0, watched - alone), peer))
 
 
 async def _load_percent(work: Callable[[], Awaitable[None]]) -> float:

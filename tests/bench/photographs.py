@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, absolute, progress, ratio_at_most, side_by_side, skipped
+from tests.bench.figures import Figure, compare, make_absolute, make_skipped, report_progress, set_upper_ratio_goal
 from thermostand.markers.detection import NARROW_SIGMA, WIDE_SIGMA, Detection, Image, detect
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import Target, load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 Float = NDArray[np.float64]
 
@@ -34,27 +34,29 @@ def figures(directory: Path) -> list[Figure]:
     """Held-out errors beside OpenCV and beside other bands, and chi^2 of the claimed covariances."""
     paths = [IMAGES / f"{number}.png" for number in range(COUNT)]
     if not all(path.exists() for path in paths):
-        return [skipped("photographs, held-out dots", "they are not here")]
-    progress("markers, photographs")
-    target = load_target(packaged("targets", "robot-cal-tools-10x10"))
+        return [make_skipped("photographs, held-out dots", "they are not here")]
+    report_progress("markers, photographs")
+    target = load_target(find_packaged("targets", "robot-cal-tools-10x10"))
     images = [read_image(path) for path in paths]
     found = [detect(image, target) for image in images]
     centres = [detection.centres_px for detection in found]
     ours_mpx = _error_mpx(centres, target)
-    grids = [_opencv(image, detection, target) for image, detection in zip(images, found, strict=True)]
-    lines = [ratio_at_most(1.05, _beside("cv2.findCirclesGrid", ours_mpx, _error_mpx(grids, target)))]
+    grids = [_find_opencv_centres(image, detection, target) for image, detection in zip(images, found, strict=True)]
+    lines = [set_upper_ratio_goal(1.05, _compare("cv2.findCirclesGrid", ours_mpx, _error_mpx(grids, target)))]
     for name, band_sigma in (("9 blurs", WIDE_SIGMA), ("6 blurs", 6.0), ("4.5 blurs", NARROW_SIGMA)):
         fixed = [_in_band(image, target, one, band_sigma) for image, one in zip(images, found, strict=True)]
-        lines.append(ratio_at_most(_BEST_BAND, _beside(f"a band of {name}", ours_mpx, _error_mpx(fixed, target))))
+        lines.append(
+            set_upper_ratio_goal(_BEST_BAND, _compare(f"a band of {name}", ours_mpx, _error_mpx(fixed, target)))
+        )
     chi2 = np.concatenate([_squares(one.centres_px, target, one.covariance_px2) for one in found])
     return [
         *lines,
-        absolute("photographs, chi^2 of held-out dots, the sheet's errors with it", "", [float(chi2.mean())]),
+        make_absolute("photographs, chi^2 of held-out dots, the sheet's errors with it", "", [float(chi2.mean())]),
     ]
 
 
-def _beside(peer: str, ours_mpx: float, other_mpx: float) -> Figure:
-    return side_by_side("photographs, held-out dots", "mpx RMS", peer, [ours_mpx], [other_mpx])
+def _compare(peer: str, ours_mpx: float, other_mpx: float) -> Figure:
+    return compare("photographs, held-out dots", "mpx RMS", peer, [ours_mpx], [other_mpx])
 
 
 def _in_band(image: Image, target: Target, found: Detection, band_sigma: float) -> Float:
@@ -66,7 +68,7 @@ def _in_band(image: Image, target: Target, found: Detection, band_sigma: float) 
     return detect(image, target, before).centres_px
 
 
-def _opencv(image: Image, detection: Detection, target: Target) -> Float:
+def _find_opencv_centres(image: Image, detection: Detection, target: Target) -> Float:
     """findCirclesGrid's centres in the order of the target's markers."""
     grid = cv2.findCirclesGrid(image, (target.columns, target.rows))[1].reshape(-1, 2).astype(np.float64)
     return grid[np.linalg.norm(detection.centres_px[:, None] - grid[None], axis=2).argmin(axis=1)]

@@ -20,21 +20,29 @@ from pathlib import Path
 import cv2
 from mcap.writer import CompressionType
 
-from tests.bench.figures import Figure, absolute, at_least, at_most, progress, ratio_at_least, side_by_side
-from tests.compensation.rendered import Scene, photograph, render
-from tests.recording.declared import declared
-from tests.recording.stored import CAMERA_TOPICS, stored
+from tests.bench.figures import (
+    Figure,
+    compare,
+    make_absolute,
+    report_progress,
+    set_lower_goal,
+    set_lower_ratio_goal,
+    set_upper_goal,
+)
+from tests.compensation.renderer import Scene, photograph, render
+from tests.recording.device_declarations import declare_devices
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.images import ZSTD_LEVEL, ImageArray
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import telemetry_topics
-from thermostand.recording.writing.segment import SeriesForm
+from thermostand.recording.writing.segment import SeriesSpec
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import list_telemetry_topics
 from thermostand.recording.writing.telemetry import TelemetryEncoder
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 COUNT = 3600
 FEW = 450  # an eighth
@@ -47,7 +55,7 @@ SEQUENCE = (
     *(("fit", degC) for degC in (31.0, 45.0, 52.0, 38.0, 10.0, 17.0)),
     *(("validation", degC) for degC in (27.0, 41.0, 48.0, 13.0, 20.0)),
 )
-DEVICES = declared({"thermometers": "thermometers", "camera": "camera"})
+DEVICES = declare_devices({"thermometers": "thermometers", "camera": "camera"})
 PEER = "cv2.findCirclesGrid, 2 workers, nothing else"
 
 
@@ -55,36 +63,36 @@ def figures(directory: Path) -> list[Figure]:
     """Seconds for the whole, frames per second beside the peer, and the memory for 450 and for 3600 frames."""
     sessions = {count: directory / f"pipeline-{count}" for count in (FEW, COUNT)}
     try:
-        progress("pipeline, rendering and writing 8 GB")
-        photographs = [photographed(index) for index in range(len(SEQUENCE))]
+        report_progress("pipeline, rendering and writing 8 GB")
+        photographs = [render_photograph(index) for index in range(len(SEQUENCE))]
         for count, session in sessions.items():
             write_session(session, photographs, count)
-        progress("pipeline, 450 frames to a report, with one worker and with two")
-        alone, few = (_reported(sessions[FEW], workers) for workers in (1, WORKERS))
-        progress("pipeline, 3600 frames to a report")
-        many = _reported(sessions[COUNT], WORKERS)
-        progress("pipeline, the peer")
+        report_progress("pipeline, 450 frames to a report, with one worker and with two")
+        alone, few = (_run_report(sessions[FEW], workers) for workers in (1, WORKERS))
+        report_progress("pipeline, 3600 frames to a report")
+        many = _run_report(sessions[COUNT], WORKERS)
+        report_progress("pipeline, the peer")
         peer = _peer_frames_per_s(sessions[COUNT])
     finally:
         for session in sessions.values():
             shutil.rmtree(session, ignore_errors=True)
     own = COUNT / many.wall_s
     return [
-        at_most(30, absolute("3600 frames of 5 MP to a report", "s", [many.wall_s])),
-        ratio_at_least(10, side_by_side("the same, detection, fit and report", "frames/s", PEER, [own], [peer])),
-        ratio_at_least(
+        set_upper_goal(30, make_absolute("3600 frames of 5 MP to a report", "s", [many.wall_s])),
+        set_lower_ratio_goal(10, compare("the same, detection, fit and report", "frames/s", PEER, [own], [peer])),
+        set_lower_ratio_goal(
             1.8,
-            side_by_side("450 frames to a report", "frames/s", "1 worker", [FEW / few.wall_s], [FEW / alone.wall_s]),
+            compare("450 frames to a report", "frames/s", "1 worker", [FEW / few.wall_s], [FEW / alone.wall_s]),
         ),
-        side_by_side("  what of it is not shared out", "CPU s", "all with 1 worker", [few.cpu_s], [alone.cpu_s]),
-        absolute("memory of its largest process", "MB", [many.peak_MB]),
-        at_most(1.1, absolute("the same over that for 450 frames", "", [many.peak_MB / few.peak_MB])),
-        at_least(1, absolute("report written", "", [float(many.written)])),
+        compare("  what of it is not shared out", "CPU s", "all with 1 worker", [few.cpu_s], [alone.cpu_s]),
+        make_absolute("memory of its largest process", "MB", [many.peak_MB]),
+        set_upper_goal(1.1, make_absolute("the same over that for 450 frames", "", [many.peak_MB / few.peak_MB])),
+        set_lower_goal(1, make_absolute("report written", "", [float(many.written)])),
     ]
 
 
 @dataclass(frozen=True)
-class Reported:
+class ReportCost:
     """cpu_s: of the program itself, without the processes that it shares the work out to."""
 
     wall_s: float
@@ -93,7 +101,7 @@ class Reported:
     written: bool
 
 
-def _reported(session: Path, workers: int) -> Reported:
+def _run_report(session: Path, workers: int) -> ReportCost:
     """The command, as a user calls it; its memory is that of the largest process below a fresh one."""
     out = session.with_suffix(".html")
     program = (
@@ -109,7 +117,7 @@ def _reported(session: Path, workers: int) -> Reported:
     )  # fmt: skip
     wall_s = time.perf_counter() - begin_s
     peak_KiB, cpu_s = done.stdout.split()
-    return Reported(wall_s, float(cpu_s), int(peak_KiB) * 1024 / 1e6, out.stat().st_size > 0)
+    return ReportCost(wall_s, float(cpu_s), int(peak_KiB) * 1024 / 1e6, out.stat().st_size > 0)
 
 
 def _peer_frames_per_s(session: Path) -> float:
@@ -133,7 +141,7 @@ def _peer(session: Path, first: int, end: int) -> int:
     return sum(cv2.findCirclesGrid(opened.frame(number).image, (9, 6))[0] for number in range(first, end))
 
 
-def photographed(index: int) -> ImageArray:
+def render_photograph(index: int) -> ImageArray:
     """A photograph of the target, drifted by 0.009 and 0.026 px/K."""
     above_K = SEQUENCE[index][1] - 24
     scene = Scene(tilt_y_deg=3, roll_deg=1, shift_mm=(0.001 * above_K, 0.003 * above_K))
@@ -142,16 +150,16 @@ def photographed(index: int) -> ImageArray:
 
 def write_session(session: Path, photographs: list[ImageArray], count: int) -> None:
     metadata = {"session_id": session.name, "recipe": "pipeline", "camera_serial": "TS-0001", "simulated": "true"}
-    attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text(encoding="utf-8")}
+    attachments = {"target.yaml": find_packaged("targets", "paper-9x6").read_text(encoding="utf-8")}
     encoder = TelemetryEncoder(DEVICES)
     forms = [
         (FRAMES, CAMERA_TOPICS, CompressionType.ZSTD, 1_000_000_000),
-        (TELEMETRY, telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000),
+        (TELEMETRY, list_telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000),
     ]
     series: list[Series] = []
     for folder, topics, compression, size in forms:
         (session / folder).mkdir(parents=True)
-        form = SeriesForm(folder, topics, compression, metadata, attachments, size, 600 * NS_PER_S, level=ZSTD_LEVEL)
+        form = SeriesSpec(folder, topics, compression, metadata, attachments, size, 600 * NS_PER_S, level=ZSTD_LEVEL)
         series.append(Series(session / folder, form))
     frames, telemetry = series
     for number in range(count):
@@ -159,7 +167,7 @@ def write_session(session: Path, photographs: list[ImageArray], count: int) -> N
         index = number * len(SEQUENCE) // count
         degC = SEQUENCE[index][1] + 20
         frame = Frame("camera.image", photographs[index], time_ns, 0.1, 0.0, degC, number, time_ns, 0, f"step-{index}")
-        frames.commit(stored(frame), time_ns)
+        frames.commit(make_frame_records(frame), time_ns)
         begins = number == 0 or index != (number - 1) * len(SEQUENCE) // count
         records = [record for item in _items(index, time_ns, begins) for record in encoder.encode(item)]
         telemetry.commit(records, time_ns)

@@ -21,20 +21,28 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, absolute, at_most, in_turns, milliseconds, progress, side_by_side
-from tests.recording.declared import PLACES
+from tests.bench.figures import (
+    Figure,
+    compare,
+    make_absolute,
+    measure_in_turns,
+    measure_milliseconds,
+    report_progress,
+    set_upper_goal,
+)
+from tests.recording.device_declarations import PLACES
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
 from tests.recording.recordings import DEVICES
-from tests.recording.stored import CAMERA_TOPICS, stored
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import batch_form
+from thermostand.recording.format.batches import make_batch_schema
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import telemetry_topics
-from thermostand.recording.writing.segment import SeriesForm, Topic
+from thermostand.recording.writing.segment import SeriesSpec, Topic
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import list_telemetry_topics
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 ROUNDS = 50
@@ -62,19 +70,19 @@ def figures(directory: Path) -> list[Figure]:
 
 
 def _write_sessions(small: Path, large: Path, night: Path) -> None:
-    progress("reading, 5 GB of frames are written")
+    report_progress("reading, 5 GB of frames are written")
     _write_frames(large)
     write_telemetry(large, SEGMENTS * FRAMES_PER_SEGMENT // 2)
     (small / FRAMES).mkdir(parents=True)
     os.link(large / FRAMES / "0000.mcap", small / FRAMES / "0000.mcap")
     write_telemetry(small, FRAMES_PER_SEGMENT // 2)
-    progress("reading, 16 h of telemetry are written")
+    report_progress("reading, 16 h of telemetry are written")
     write_telemetry(night, NIGHT_s)
 
 
 def _series(folder: Path, topics: tuple[Topic, ...], compression: CompressionType, segment_bytes: int) -> Series:
     folder.mkdir(parents=True)
-    form = SeriesForm(folder.name, topics, compression, METADATA, ATTACHMENTS, segment_bytes, 600 * NS_PER_S)
+    form = SeriesSpec(folder.name, topics, compression, METADATA, ATTACHMENTS, segment_bytes, 600 * NS_PER_S)
     return Series(folder, form)
 
 
@@ -84,7 +92,7 @@ def _write_frames(session: Path) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (HEIGHT_px + 100, WIDTH_px), np.uint8)
     for number in range(SEGMENTS * FRAMES_PER_SEGMENT):
         frame = _frame(number, noise[number % 100 :][:HEIGHT_px])
-        series.commit(stored(frame), frame.time_ns)
+        series.commit(make_frame_records(frame), frame.time_ns)
     series.finish()
 
 
@@ -96,7 +104,7 @@ def _frame(number: int, image: NDArray[np.uint8]) -> Frame:
 def write_telemetry(session: Path, duration_s: int) -> None:
     """Seven devices, each read every second."""
     encoder = TelemetryEncoder(DEVICES)
-    series = _series(session / TELEMETRY, telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000)
+    series = _series(session / TELEMETRY, list_telemetry_topics(DEVICES), CompressionType.ZSTD, 1_000_000_000)
     image = np.zeros((1, 1), np.uint8)
     for begin in range(0, duration_s, 60):
         records = [
@@ -121,36 +129,38 @@ def _batches(second: int) -> Iterator[Batch]:
 
 
 def _frame_figures(small: Path, large: Path) -> list[Figure]:
-    progress("reading, random frames")
+    report_progress("reading, random frames")
     with ExitStack() as files:
         readers = [make_reader(files.enter_context(path.open("rb")), validate_crcs=True) for path in _frames(large)]
         opened = Session.open(large)
         fresh = {path: _random(_fresh_frame, path) for path in (small, large)}
-        own, other = in_turns(fresh[large], _random(_peer_frame, large), ROUNDS)
-        own_open, other_open = in_turns(
-            lambda: milliseconds(lambda: opened.frame(_numbers.randrange(opened.frame_count))),
-            lambda: milliseconds(lambda: _frame_of(readers, _numbers.randrange(opened.frame_count))),
+        own, other = measure_in_turns(fresh[large], _random(_peer_frame, large), ROUNDS)
+        own_open, other_open = measure_in_turns(
+            lambda: measure_milliseconds(lambda: opened.frame(_numbers.randrange(opened.frame_count))),
+            lambda: measure_milliseconds(lambda: _frame_of(readers, _numbers.randrange(opened.frame_count))),
             ROUNDS,
         )
-        own_read, bare_read = in_turns(
-            lambda: milliseconds(lambda: opened.frame(_numbers.randrange(opened.frame_count))),
+        own_read, bare_read = measure_in_turns(
+            lambda: measure_milliseconds(lambda: opened.frame(_numbers.randrange(opened.frame_count))),
             _random(_bare_read, large),
             ROUNDS,
         )
-        in_large, in_small = in_turns(fresh[large], fresh[small], ROUNDS)
+        in_large, in_small = measure_in_turns(fresh[large], fresh[small], ROUNDS)
     return [
-        at_most(10, side_by_side("reading, 5 GB: open, random 5 MP frame", "ms", "mcap make_reader, CRCs", own, other)),
-        at_most(
-            10,
-            side_by_side("reading, 5 GB open: random 5 MP frame", "ms", "the same, readers open", own_open, other_open),
+        set_upper_goal(
+            10, compare("reading, 5 GB: open, random 5 MP frame", "ms", "mcap make_reader, CRCs", own, other)
         ),
-        side_by_side("reading, 5 GB open: random 5 MP frame", "ms", "bare pread of the bytes", own_read, bare_read),
-        side_by_side("reading, 5 GB: open, random 5 MP frame", "ms", "ours, 1 GB", in_large, in_small),
-        side_by_side(
+        set_upper_goal(
+            10,
+            compare("reading, 5 GB open: random 5 MP frame", "ms", "the same, readers open", own_open, other_open),
+        ),
+        compare("reading, 5 GB open: random 5 MP frame", "ms", "bare pread of the bytes", own_read, bare_read),
+        compare("reading, 5 GB: open, random 5 MP frame", "ms", "ours, 1 GB", in_large, in_small),
+        compare(
             "reading, 1 GB: open, table of 200 frames",
             "ms",
             "mcap make_reader, CRCs",
-            *in_turns(_timed(_own_table, small), _timed(_peer_table, small), 5),
+            *measure_in_turns(_timed(_own_table, small), _timed(_peer_table, small), 5),
         ),
     ]
 
@@ -161,7 +171,7 @@ _numbers = random.Random(7)
 def _random(read: Callable[[Path, int], object], session: Path) -> Callable[[], float]:
     """A measurement: `read` one frame of the session at random, ms."""
     count = FRAMES_PER_SEGMENT * len(_frames(session))
-    return lambda: milliseconds(lambda: read(session, _numbers.randrange(count)))
+    return lambda: measure_milliseconds(lambda: read(session, _numbers.randrange(count)))
 
 
 def _frames(session: Path) -> list[Path]:
@@ -208,22 +218,22 @@ def _peer_table(session: Path) -> object:
 
 
 def _temperature_figures(small: Path, large: Path, night: Path) -> list[Figure]:
-    progress("reading, temperatures")
+    report_progress("reading, temperatures")
     found = [
-        side_by_side(
+        compare(
             f"reading, {what}: open, all temperatures",
             "ms",
             "mcap make_reader, CRCs, protobuf",
-            *in_turns(_timed(_own_temperatures, path), _timed(_peer_temperatures, path), rounds),
+            *measure_in_turns(_timed(_own_temperatures, path), _timed(_peer_temperatures, path), rounds),
         )
         for what, path, rounds in (("5 GB", large, 20), ("16 h", night, 5))
     ]
-    found[0] = at_most(100, found[0])
-    return [*found, absolute("reading, 5 GB: open", "ms", [_timed(Session.open, large)() for _ in range(ROUNDS)])]
+    found[0] = set_upper_goal(100, found[0])
+    return [*found, make_absolute("reading, 5 GB: open", "ms", [_timed(Session.open, large)() for _ in range(ROUNDS)])]
 
 
 def _timed(read: Callable[[Path], object], session: Path) -> Callable[[], float]:
-    return lambda: milliseconds(lambda: read(session))
+    return lambda: measure_milliseconds(lambda: read(session))
 
 
 def _own_temperatures(session: Path) -> list[NDArray[np.float64]]:
@@ -237,7 +247,7 @@ def _peer_temperatures(session: Path) -> list[NDArray[np.float64]]:
 
 
 def _peer_rows(path: Path) -> Iterable[list[float]]:
-    form = batch_form("thermometers", DEVICES["thermometers"])
+    form = make_batch_schema("thermometers", DEVICES["thermometers"])
     topic, parse = form.topic, form.message.FromString
     with path.open("rb") as file:
         for _, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):

@@ -8,19 +8,19 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from tests.bench.figures import Figure, at_most, progress
-from tests.system.regulator_steps import DRAWN, Step, steps_of, tuned_in
+from tests.bench.figures import Figure, report_progress, set_upper_goal
+from tests.system.regulator_steps import DRAWN, Step, autotune_in, steps_of
 
 
 def figures(directory: Path) -> list[Figure]:
     """Goals: 0.1 K at rest, 0.5 K of overshoot, in the standard chamber and, autotuned, in ten drawn ones."""
     found: list[Figure] = []
     for what, seeds in (("standard chamber", (None,)), (f"{len(DRAWN)} drawn chambers", tuple(DRAWN))):
-        progress(f"our own regulator, autotuned, in {what}")
-        steps = [step for seed in seeds for step in steps_of("software-regulator", seed, tuned_in(seed))]
+        report_progress(f"our own regulator, autotuned, in {what}")
+        steps = [step for seed in seeds for step in steps_of("software-regulator", seed, autotune_in(seed))]
         overshoot_K, worst_K = max(step.overshoot_K for step in steps), max(step.worst_K for step in steps)
-        found.append(at_most(0.5, Figure(f"software regulator, overshoot, {what}", "K", overshoot_K)))
-        found.append(at_most(0.1, Figure("  farthest from the set-point in the last 30 min", "K", worst_K)))
+        found.append(set_upper_goal(0.5, Figure(f"software regulator, overshoot, {what}", "K", overshoot_K)))
+        found.append(set_upper_goal(0.1, Figure("  farthest from the set-point in the last 30 min", "K", worst_K)))
     return found
 
 
@@ -46,7 +46,7 @@ def main() -> None:
     )
     write(f"{head}\n|---|---|---|---|---|---|---|---|---|\n")
     for seed in DRAWN if is_drawn else (None,):
-        for step in steps_of("software-regulator", seed, tuned_in(seed)):
+        for step in steps_of("software-regulator", seed, autotune_in(seed)):
             write(_row(f"software, chamber {seed}" if is_drawn else "software", step))
         for step in steps_of("simulated", seed):
             write(_row(f"E5CC, chamber {seed}" if is_drawn else "E5CC", step))

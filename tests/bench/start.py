@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.bench.figures import Figure, in_turns, process_ms, ratio_at_most, side_by_side
+from tests.bench.figures import Figure, compare, measure_in_turns, measure_process_ms, set_upper_ratio_goal
 
 ROUNDS = 5
 PEER = ("-c", "import numpy, google.protobuf, mcap")
@@ -21,6 +21,10 @@ def figures(folder: Path) -> list[Figure]:
     """Each beside the import of numpy, protobuf and mcap."""
     found: list[Figure] = []
     for what, words in OURS.items():
-        ours, others = in_turns(lambda words=words: process_ms(*words), lambda: process_ms(*PEER), ROUNDS)
-        found.append(ratio_at_most(MOST, side_by_side(what, "ms", "import numpy, google.protobuf, mcap", ours, others)))
+        ours, others = measure_in_turns(
+            lambda words=words: measure_process_ms(*words), lambda: measure_process_ms(*PEER), ROUNDS
+        )
+        found.append(
+            set_upper_ratio_goal(MOST, compare(what, "ms", "import numpy, google.protobuf, mcap", ours, others))
+        )
     return found

@@ -16,13 +16,13 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tests.bench.figures import Figure, at_most, progress
-from tests.bench.viewers import VIEWERS, followed
-from tests.bench.waiting import beside, p99, waiting
+from tests.bench.figures import Figure, report_progress, set_upper_goal
+from tests.bench.viewers import VIEWERS, run_viewers
+from tests.bench.waiting import compare_with_waiting, compute_p99, run_waiting_process
 from tests.stand import floods
 from tests.stand.test_interface_access import free_port
 from thermostand.foundation.errors import SessionError
-from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.serving.client import Server, find_session_server
 
 STOPS, FLOODED_STOPS = 200, 10
 LIMIT_ms, FLOODED_LIMIT_ms = 20.0, 1000.0
@@ -32,14 +32,14 @@ BETWEEN_S = 0.12  # two STOPs within 0.1 s would be one
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.secop.door import door_at
-from tests.stand.a_desk import ADesk, served
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.secop.listener import make_secop_listener
+from tests.stand.fake_service import FakeService, serve_fake
 
 async def run():
     folder, port, secop_port = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    interface = Interface(folder.parent, port=port, doors=(door_at(secop_port),))
-    async with served(ADesk(), folder, interface) as desk:
+    interface = Interface(folder.parent, port=port, doors=(make_secop_listener(secop_port),))
+    async with serve_fake(FakeService(), folder, interface) as desk:
         print("ready", flush=True)
         number = 0
         while True:
@@ -58,34 +58,34 @@ def figures(directory: Path) -> list[Figure]:
     session = directory / "night"
     session.mkdir()
     found: list[Figure] = []
-    with _daemon(session) as ports:
-        local, remote = server_of(session), Server("the daemon", url=f"http://127.0.0.1:{ports[0]}")
+    with _run_daemon(session) as ports:
+        local, remote = find_session_server(session), Server("the daemon", url=f"http://127.0.0.1:{ports[0]}")
         local.state(30.0)  # everything is imported
         ways = {"over TCP": remote, "by `stand stop`": local}
-        found += _side(ways, "alone")
-        with followed(session):
+        found += _measure_ways(ways, "alone")
+        with run_viewers(session):
             time.sleep(2.0)
-            found += _side(ways, f"{VIEWERS} viewers")
+            found += _measure_ways(ways, f"{VIEWERS} viewers")
         for name in floods.FLOODS:
-            progress(f"STOP beside {name}")
-            with _flooded(name, ports):
+            report_progress(f"STOP beside {name}")
+            with _run_flood(name, ports):
                 for way, server in ways.items():
                     times_ms = [_stop_ms(server) for _ in range(FLOODED_STOPS)]
                     seen = f"longest of {FLOODED_STOPS}; shortest {min(times_ms):.1f} ms"
                     what = f"STOP {way} to its answer, {name}"
-                    found.append(at_most(FLOODED_LIMIT_ms, Figure(what, "ms", max(times_ms), seen)))
+                    found.append(set_upper_goal(FLOODED_LIMIT_ms, Figure(what, "ms", max(times_ms), seen)))
     return found
 
 
-def _side(ways: dict[str, Server], beside_what: str) -> list[Figure]:
+def _measure_ways(ways: dict[str, Server], beside_what: str) -> list[Figure]:
     found: list[Figure] = []
     for way, server in ways.items():
-        progress(f"STOP {way}, {STOPS} times, {beside_what}")
-        with waiting() as waited_ms:
+        report_progress(f"STOP {way}, {STOPS} times, {beside_what}")
+        with run_waiting_process() as waited_ms:
             times_ms = [_stop_ms(server) for _ in range(STOPS)]
         seen = f"p99 of {STOPS}; median {sorted(times_ms)[STOPS // 2]:.1f}, longest {max(times_ms):.1f} ms"
-        figure = Figure(f"STOP {way} to its answer, {beside_what}", "ms", p99(times_ms), seen)
-        found.append(at_most(LIMIT_ms, beside(figure, waited_ms)))
+        figure = Figure(f"STOP {way} to its answer, {beside_what}", "ms", compute_p99(times_ms), seen)
+        found.append(set_upper_goal(LIMIT_ms, compare_with_waiting(figure, waited_ms)))
     return found
 
 
@@ -101,7 +101,7 @@ def _stop_ms(server: Server) -> float:
 
 
 @contextmanager
-def _daemon(session: Path) -> Generator[tuple[int, int]]:
+def _run_daemon(session: Path) -> Generator[tuple[int, int]]:
     ports = free_port(), free_port()
     command = [sys.executable, "-c", DAEMON, str(session), *map(str, ports)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
@@ -114,7 +114,7 @@ def _daemon(session: Path) -> Generator[tuple[int, int]]:
 
 
 @contextmanager
-def _flooded(name: str, ports: tuple[int, int]) -> Generator[None]:
+def _run_flood(name: str, ports: tuple[int, int]) -> Generator[None]:
     command, variables = [sys.executable, "-S", floods.__file__, name], {"PORTS": f"{ports[0]} {ports[1]}"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, **variables}) as process:
         try:

@@ -13,14 +13,14 @@ import shutil
 import time
 from pathlib import Path
 
-from tests.bench.figures import Figure, absolute, in_turns, progress, require_aravis, side_by_side
+from tests.bench.figures import Figure, compare, make_absolute, measure_in_turns, report_progress, require_aravis
 from tests.system.simulated_orders import simulated_order
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
 from thermostand.stand.running.order import Order
-from thermostand.stand.service.run import one_cpu, run_virtual
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
+from thermostand.stand.service.run import pin_to_one_cpu, run_virtual
+from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 ROUNDS = 5
 SOAK_s = 1800.0
@@ -41,18 +41,18 @@ def figures(directory: Path) -> list[Figure]:
     trips_per_s: list[float] = []
 
     def run() -> float:
-        progress(f"{what}: a run of two soaks of {SOAK_s:g} s")
+        report_progress(f"{what}: a run of two soaks of {SOAK_s:g} s")
         return _soaked_per_second(order, next(sessions))
 
     def limit() -> float:
-        with one_cpu():  # as the run does
+        with pin_to_one_cpu():  # as the run does
             trips_per_s.append(asyncio.run(_round_trips_per_second(order)))
         return trips_per_s[-1] * STEP_s
 
-    ours, bare = in_turns(run, limit, ROUNDS)
+    ours, bare = measure_in_turns(run, limit, ROUNDS)
     return [
-        side_by_side(what, "sim s/s", f"bare control-socket advances of {STEP_s:g} s", ours, bare),
-        absolute(f"bare control-socket advance of {STEP_s:g} s", "round trips/s", trips_per_s[1:]),
+        compare(what, "sim s/s", f"bare control-socket advances of {STEP_s:g} s", ours, bare),
+        make_absolute(f"bare control-socket advance of {STEP_s:g} s", "round trips/s", trips_per_s[1:]),
     ]
 
 
@@ -82,7 +82,7 @@ async def _round_trips_per_second(order: Order) -> float:
     simulation = order.config.simulation
     if simulation is None:
         raise ValueError("the bench's configuration has lost its simulation section")
-    simulator = Simulator(laboratory_of(order.config, virtual=True, seed=None))
+    simulator = Simulator(describe_laboratory(order.config, virtual=True, seed=None))
     control = ControlSocket(simulation.control)
     try:
         await control.open()
@@ -90,7 +90,7 @@ async def _round_trips_per_second(order: Order) -> float:
         steps = round(2 * SOAK_s / STEP_s)
         begin_s = time.perf_counter()
         for number in range(1, steps + 1):
-            await control.advance(now_ns + number * seconds_ns(STEP_s))
+            await control.advance(now_ns + number * to_ns(STEP_s))
         return steps / (time.perf_counter() - begin_s)
     finally:
         await control.close()

@@ -32,7 +32,7 @@ OFTEN_s = 0.05
 
 
 @contextmanager
-def waiting(interval_s: float = OFTEN_s) -> Generator[list[float]]:
+def run_waiting_process(interval_s: float = OFTEN_s) -> Generator[list[float]]:
     """How late a process beside that only waits goes on, ms; filled when the inside is left."""
     late_ms: list[float] = []
     command = [sys.executable, "-c", WAIT, str(interval_s)]
@@ -44,14 +44,14 @@ def waiting(interval_s: float = OFTEN_s) -> Generator[list[float]]:
             late_ms += json.loads(process.communicate()[0])
 
 
-def p99(values: Sequence[float]) -> float:
+def compute_p99(values: Sequence[float]) -> float:
     """The 99th percentile."""
     return statistics.quantiles(values, n=100, method="inclusive")[98]
 
 
-def beside(figure: Figure, waited_ms: Sequence[float]) -> Figure:
+def compare_with_waiting(figure: Figure, waited_ms: Sequence[float]) -> Figure:
     """The figure, a 99th percentile in ms, with that of a process that only waited meanwhile, and what it is more."""
-    bare_ms = p99(waited_ms)
+    bare_ms = compute_p99(waited_ms)
     text = f"a process that only waits: p99 {bare_ms:.2f}, greatest {max(waited_ms):.2f} ms; "
     text += f"{figure.value / bare_ms:.1f} times that, {figure.value - bare_ms:+.2f} ms"
     return replace(figure, peer=f"{figure.peer}; {text}")

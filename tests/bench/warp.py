@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.bench.figures import Figure, at_most, in_turns, processor_ms, progress, side_by_side
-from tests.compensation.rendered import Scene, render
-from thermostand.compensation.apply.compensate_images import warp
+from tests.bench.figures import Figure, compare, measure_in_turns, measure_processor_ms, report_progress, set_upper_goal
+from tests.compensation.renderer import Scene, render
+from thermostand.compensation.apply.image_correction import warp
 from thermostand.compensation.drift_runtime import source_offset
 from thermostand.markers.detection import detect
 from thermostand.markers.target import load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 ROUNDS = 7
 NOT_SPLIT: Any = None  # its stub wants two maps
@@ -30,7 +30,7 @@ Float = NDArray[np.float64]
 
 def figures(directory: Path) -> list[Figure]:
     """ms per 5 MP frame, and mpx RMS of the markers."""
-    progress("warp, rendering the frame")
+    report_progress("warp, rendering the frame")
     cv2.setNumThreads(1)
     scene = Scene(psf_px=0.8, tilt_y_deg=4, roll_deg=1)
     image = (256 * render(scene)).astype(np.uint16)
@@ -38,12 +38,12 @@ def figures(directory: Path) -> list[Figure]:
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     at = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
     at = (at + source_offset(_drift, at)).astype(np.float32).reshape(height, width, 2)
-    own, other = in_turns(
-        lambda: processor_ms(lambda: warp(image, _drift)),
-        lambda: processor_ms(lambda: cv2.remap(image, at, NOT_SPLIT, cv2.INTER_LANCZOS4)),
+    own, other = measure_in_turns(
+        lambda: measure_processor_ms(lambda: warp(image, _drift)),
+        lambda: measure_processor_ms(lambda: cv2.remap(image, at, NOT_SPLIT, cv2.INTER_LANCZOS4)),
         ROUNDS,
     )
-    target = load_target(packaged("targets", "paper-9x6"))
+    target = load_target(find_packaged("targets", "paper-9x6"))
     before = detect(image, target).centres_px
     expected = before + _drift(before)
     errors = [
@@ -54,8 +54,8 @@ def figures(directory: Path) -> list[Figure]:
         )
     ]
     return [
-        at_most(25, side_by_side("warp, 5 MP frame", "ms/frame", PEER, own, other)),
-        at_most(0.5, side_by_side("warp, error of the markers", "mpx RMS", PEER, errors[:1], errors[1:])),
+        set_upper_goal(25, compare("warp, 5 MP frame", "ms/frame", PEER, own, other)),
+        set_upper_goal(0.5, compare("warp, error of the markers", "mpx RMS", PEER, errors[:1], errors[1:])),
     ]
 
 

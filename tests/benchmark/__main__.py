@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from .benchmark_cases import CAMERAS, GROUPS, TRAININGS, Case, make_case
 from .methods import METHODS
-from .nights import CAMERAS, GROUPS, TRAININGS, Case, case
-from .scoring import Method, Score, scores, table
+from .scoring import Method, Score, format_table, score_method
 
 
 def main() -> None:
@@ -27,22 +27,22 @@ def main() -> None:
     given = parser.parse_args()
     if given.write is not None:
         for way, group, number in product(TRAININGS, GROUPS, range(given.cameras)):
-            write(case(group, number, way), given.write)
+            write(make_case(group, number, way), given.write)
         return
-    methods = {**METHODS, **dict(loaded(path) for path in given.method)}
+    methods = {**METHODS, **dict(load_method(path) for path in given.method)}
     begin_s = time.monotonic()
     for way, group in product(TRAININGS, GROUPS):
         found: list[Score] = []
         for number in range(given.cameras):
-            one = case(group, number, way)
+            one = make_case(group, number, way)
             for name, method in methods.items():
-                found += scores(name, method, one)
+                found += score_method(name, method, one)
             sys.stderr.write(f"  [{time.monotonic() - begin_s:4.0f} s] {way}, {group}, camera {number}\n")
-        sys.stdout.write(f"{table(found, methods)}\n")
+        sys.stdout.write(f"{format_table(found, methods)}\n")
         sys.stdout.flush()
 
 
-def loaded(path: Path) -> tuple[str, Method]:
+def load_method(path: Path) -> tuple[str, Method]:
     """NAME and fit of a file."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None or not path.is_file():

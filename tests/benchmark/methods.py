@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from thermostand.compensation.drift.choosing import fit
-from thermostand.compensation.drift.displacements import displacements
+from thermostand.compensation.drift.displacements import compute_displacements
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.model_selection import fit
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.expression import AIR
 from thermostand.compensation.history.thermal_history import States
 from thermostand.compensation.observations import Observations
@@ -47,7 +47,7 @@ def corrector(model: DriftModel) -> Corrector:
     """Of a fitted model."""
 
     def corrected(night: Observations, frames: NDArray[np.int64], seen_px: Float) -> Correction:
-        states = frame_states(night, model.memory)
+        states = compute_frame_states(night, model.memory)
         asked = model.of_sessions(one.session_id for one in night.sessions)
         places, sigma = np.empty_like(seen_px), np.empty_like(seen_px)
         inside = np.empty(seen_px.shape[:2], bool)
@@ -66,8 +66,8 @@ def gp_on_residual(training: Observations) -> Corrector:
     fitted to: over camera, air, their rate of change and the slowest lag, squared-exponential, with hyperparameters of
     largest marginal likelihood."""
     model = _model(training)
-    states = frame_states(training, model.memory)
-    rows = displacements(training, training.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
+    states = compute_frame_states(training, model.memory)
+    rows = compute_displacements(training, training.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
     left = rows.displacement_px - model.shift(rows.measured_px, states.where(rows.frame))
     frames, index, count = np.unique(rows.frame, return_inverse=True, return_counts=True)
     shift = np.stack([np.bincount(index, axis) / count for axis in left.T], axis=1)
@@ -79,7 +79,7 @@ def gp_on_residual(training: Observations) -> Corrector:
 
     def corrected(night: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
         answer = plain(night, asked, seen_px)
-        wanted = (_inputs(frame_states(night, model.memory))[asked] - middle) / spread
+        wanted = (_inputs(compute_frame_states(night, model.memory))[asked] - middle) / spread
         more, variance = gp.predicted(wanted)
         assert answer.sigma_px is not None
         sigma = np.sqrt(answer.sigma_px**2 + variance[:, None, None])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from thermostand.compensation.observations import Observations
 
-from .nights import GROUPS, TASKS, TRAININGS, Case
+from .benchmark_cases import GROUPS, TASKS, TRAININGS, Case
 
 Float = NDArray[np.float64]
 _SIGMA_95 = 1.959964
@@ -57,7 +57,7 @@ class Score:
     fit_s: float
 
 
-def scores(name: str, method: Method, case: Case) -> list[Score]:
+def score_method(name: str, method: Method, case: Case) -> list[Score]:
     """Of all tasks of a camera."""
     begin_s = time.perf_counter()
     corrector = method(case.training)
@@ -77,7 +77,7 @@ def scores(name: str, method: Method, case: Case) -> list[Score]:
     return found
 
 
-def table(found: Sequence[Score], methods: Mapping[str, Method]) -> str:
+def format_table(found: Sequence[Score], methods: Mapping[str, Method]) -> str:
     """A Markdown table for each training and group: median and worst camera of each task, mpx, and the share of the
     answers that the method stands by where it says so; how often its intervals hold there, over all tasks; time to
     fit."""
@@ -91,15 +91,17 @@ def table(found: Sequence[Score], methods: Mapping[str, Method]) -> str:
         lines = [
             f"Learned from {learned_from}; {cameras} cameras, {group}:",
             "",
-            _row(heads),
-            _row(["---"] * len(heads)),
+            _format_row(heads),
+            _format_row(["---"] * len(heads)),
         ]
-        lines += [_row([name, *_cells([score for score in own if score.method == name])]) for name in methods]
+        lines += [
+            _format_row([name, *_format_cells([score for score in own if score.method == name])]) for name in methods
+        ]
         blocks.append("\n".join(lines))
     return "\n\n".join(blocks) + "\n"
 
 
-def _cells(own: Sequence[Score]) -> list[str]:
+def _format_cells(own: Sequence[Score]) -> list[str]:
     cells: list[str] = []
     for task in TASKS:
         here = [score for score in own if score.task == task]
@@ -114,5 +116,5 @@ def _cells(own: Sequence[Score]) -> list[str]:
     return cells
 
 
-def _row(cells: Sequence[str]) -> str:
+def _format_row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.compensation.calibration.board import Board, board_of
+from thermostand.compensation.calibration.board import Board, make_board
 from thermostand.compensation.calibration.pose import Lens, find_pose
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableGeometry
@@ -220,7 +220,7 @@ def target_of(laboratory: Laboratory, *, measured: bool = True) -> Target:
 
 
 def board(laboratory: Laboratory, *, measured: bool = True) -> Board:
-    return board_of(target_of(laboratory, measured=measured))
+    return make_board(target_of(laboratory, measured=measured))
 
 
 def positions(laboratory: Laboratory) -> Positions:
@@ -244,7 +244,7 @@ def covariances(laboratory: Laboratory) -> Float:
 def translation_errors_um(laboratory: Laboratory, lens: Lens, known: Board, table: TableGeometry) -> Float:
     """(3, 3): V0 -> V1, V2, V3 of the target's centre in the table's frame, found minus true, X Y Z in um."""
     poses = [find_pose(lens, known, centres, covariances(laboratory)) for centres in laboratory.validation_px]
-    found = np.array([pose.place_mm(CENTRE_mm) for pose in poses]) @ table.frame.T
+    found = np.array([pose.locate_point_mm(CENTRE_mm) for pose in poses]) @ table.frame.T
     true = laboratory.validation_rotations @ CENTRE_mm + laboratory.validation_translations_mm
     true = true @ true_table_frame().T
     return 1e3 * ((found[1:] - found[0]) - (true[1:] - true[0]))

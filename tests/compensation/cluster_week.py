@@ -13,9 +13,9 @@ from typing import Any
 
 import psutil
 
-from thermostand.compensation.finding.piece import FoundMarkers, Piece, joined, pieces_of
-from thermostand.compensation.finding.workers import on_cluster
-from thermostand.compensation.observations import session_target
+from thermostand.compensation.finding.piece import FoundMarkers, Piece, concatenate_markers, split_into_pieces
+from thermostand.compensation.finding.workers import make_cluster_work
+from thermostand.compensation.observations import read_session_target
 from thermostand.recording.reading.session import Session
 
 CAMERAS = 10
@@ -27,22 +27,22 @@ class Counted(Piece):
     the scheduler, which is in this process."""
 
     def __reduce__(self) -> tuple[object, ...]:
-        return received, tuple(getattr(self, field.name) for field in fields(Piece))
+        return receive_piece, tuple(getattr(self, field.name) for field in fields(Piece))
 
 
-def received(*values: Any) -> Piece:
+def receive_piece(*values: Any) -> Piece:
     piece = Counted(*values)
-    _received(piece).mkdir(exist_ok=True)
-    (_received(piece) / f"{os.getpid()}-{time.monotonic_ns()}").touch()
+    _get_received_folder(piece).mkdir(exist_ok=True)
+    (_get_received_folder(piece) / f"{os.getpid()}-{time.monotonic_ns()}").touch()
     return piece
 
 
-def _received(piece: Piece) -> Path:
+def _get_received_folder(piece: Piece) -> Path:
     return piece.segment.parent.parent / "received"
 
 
 def _by_workers(piece: Piece) -> int:
-    return sum(not path.name.startswith(f"{os.getpid()}-") for path in _received(piece).iterdir())
+    return sum(not path.name.startswith(f"{os.getpid()}-") for path in _get_received_folder(piece).iterdir())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Week:
     twice: int
 
 
-def week(sessions: Iterable[Session], per_piece: int) -> Week:
+def run_week(sessions: Iterable[Session], per_piece: int) -> Week:
     """Find the markers of the cameras' sessions, one after the other; a worker is killed in that of `KILLED_IN`."""
     from distributed import LocalCluster
 
@@ -66,20 +66,20 @@ def week(sessions: Iterable[Session], per_piece: int) -> Week:
     with cluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1") as here:
         for camera, session in enumerate(sessions):
             workers = [psutil.Process(nanny.pid) for nanny in here.workers.values()]
-            begin_s = _used_s(workers)
-            plain = pieces_of(session, session_target(session), frames_per_piece=per_piece)
+            begin_s = _measure_used_s(workers)
+            plain = split_into_pieces(session, read_session_target(session), frames_per_piece=per_piece)
             pieces = [Counted(*_values(piece)) for piece in plain]
             parts: list[FoundMarkers] = []
-            for _, part in on_cluster(here.scheduler_address)(pieces):
+            for _, part in make_cluster_work(here.scheduler_address)(pieces):
                 parts.append(part)
                 if camera == KILLED_IN and len(parts) == 1:
                     workers[0].kill()
-            found.append(joined(parts))
+            found.append(concatenate_markers(parts))
             if camera == KILLED_IN:
                 twice = _by_workers(pieces[0]) - len(pieces)
                 continue
             memory_MB.append(max(worker.memory_info().rss for worker in workers) / 1e6)
-            used_s += _used_s(workers) - begin_s
+            used_s += _measure_used_s(workers) - begin_s
     return Week(found, memory_MB, used_s, twice)
 
 
@@ -87,5 +87,5 @@ def _values(piece: Piece) -> list[Any]:
     return [getattr(piece, field.name) for field in fields(Piece)]
 
 
-def _used_s(workers: list[psutil.Process]) -> float:
+def _measure_used_s(workers: list[psutil.Process]) -> float:
     return sum(sum(worker.cpu_times()[:2]) for worker in workers)

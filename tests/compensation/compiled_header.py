@@ -19,7 +19,7 @@ _PROGRAM = Path(__file__).with_name("header_program.c")
 
 
 @dataclass(frozen=True, eq=False)
-class Said:
+class HeaderOutput:
     """After each of S samples: flags of the state (S,), corrected points (S, N, 2), their flags (S, N), displacements
     in single precision (S, N, 2); and the maps (2, height, width) after the last one."""
 
@@ -30,7 +30,7 @@ class Said:
     maps: NDArray[np.float32]
 
 
-def compiled(header: Path, *, sanitized: bool = True) -> Path:
+def compile_header(header: Path, *, sanitized: bool = True) -> Path:
     """The program beside the header, which is called drift.h."""
     assert COMPILER is not None
     program = header.with_name("program")
@@ -39,7 +39,7 @@ def compiled(header: Path, *, sanitized: bool = True) -> Path:
     return program
 
 
-def said(program: Path, points_px: Float, samples: Float, size: tuple[int, int]) -> Said:
+def run_header(program: Path, points_px: Float, samples: Float, size: tuple[int, int]) -> HeaderOutput:
     given = np.concatenate([[float(len(points_px))], points_px.ravel(), samples.ravel()])
     maps = program.with_name("maps")
     done = subprocess.run([program, maps], input=given.tobytes(), capture_output=True, check=False)
@@ -48,7 +48,7 @@ def said(program: Path, points_px: Float, samples: Float, size: tuple[int, int])
     rows = np.frombuffer(done.stdout).reshape(len(samples), 1 + 5 * count)
     state, corrected, flags, shift = np.split(rows, [1, 1 + 2 * count, 1 + 3 * count], axis=1)
     shape = (len(samples), count, 2)
-    return Said(
+    return HeaderOutput(
         state[:, 0],
         corrected.reshape(shape),
         flags,

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tests.addresses import WORKER
-from tests.recording.declared import declared
+from tests.recording.device_declarations import declare_devices
 from thermostand.compensation.reporting.drawing import figures
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
@@ -27,7 +27,7 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.compile_ahead import compile_ahead
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
-from .rendered import Scene, photograph, render, true_centres_px
+from .renderer import Scene, compute_true_centres_px, photograph, render
 
 START_NS = 1_767_290_400 * NS_PER_S
 TARGET_YAML = "name: small\ncolumns: 9\nrows: 6\npitch_mm: 30\ndiameter_mm: 10\n"
@@ -63,7 +63,7 @@ def scene_at(index: int) -> Scene:
 def photo(index: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
     clean = render(scene_at(index))
     if index == GLARE[0]:
-        x, y = true_centres_px(scene_at(index))[GLARE[1]].round().astype(int)
+        x, y = compute_true_centres_px(scene_at(index))[GLARE[1]].round().astype(int)
         clean[y - 3 : y + 3, x + 6 : x + 10] = 180
     return photograph(scene_at(index), clean, index)
 
@@ -98,7 +98,7 @@ async def recording(
     clock, hub = VirtualClock(START_NS), Hub()
     info = SessionInfo(session_id or directory.name, recipe, serials, "operator", "0.1.0", "virtual")
     settings = RecordingSettings(telemetry_commit_s=60.0)
-    recorder = Recorder(directory, info, dict(attachments), declared(devices), hub, clock, settings=settings)
+    recorder = Recorder(directory, info, dict(attachments), declare_devices(devices), hub, clock, settings=settings)
     recorder.start()
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
     yield hub, clock
@@ -178,7 +178,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         if not made.exists():
             asyncio.run(record(path, {"target.yaml": TARGET_YAML}))
             made.touch()
-    return Recorded(path, np.array([true_centres_px(scene_at(index)) for index in range(len(SEQUENCE))]))
+    return Recorded(path, np.array([compute_true_centres_px(scene_at(index)) for index in range(len(SEQUENCE))]))
 
 
 @pytest.fixture(autouse=True)

@@ -87,7 +87,7 @@ class Camera:
         return replace(self, effects=Effects(**dict.fromkeys(names, True)))
 
 
-def drawn_camera(seed: int, *effects: str) -> Camera:
+def draw_camera(seed: int, *effects: str) -> Camera:
     """The camera of this number, with these effects; its numbers are the same whichever they are."""
     rng = np.random.default_rng([16, seed])
     rates, to_air, heat = _network(rng)
@@ -125,10 +125,10 @@ def drawn_camera(seed: int, *effects: str) -> Camera:
     )
 
 
-def drawn_unit(seed: int, number: int, *effects: str) -> Camera:
+def draw_unit(seed: int, number: int, *effects: str) -> Camera:
     """A unit of the type that the camera of this seed is the middle of: each of its numbers 15 % off, one standard
     deviation; of the heat flows all together, as the sizes of its parts are."""
-    rng, middle = np.random.default_rng([31, seed, number]), drawn_camera(seed, *effects)
+    rng, middle = np.random.default_rng([31, seed, number]), draw_camera(seed, *effects)
     quicker = 1 + UNIT_SCATTER * rng.standard_normal()
     changed: dict[str, object] = {name: getattr(middle, name) * quicker for name in ("rates", "to_air", "heat_K_per_s")}
     for field in fields(middle):
@@ -185,21 +185,21 @@ def _first_order(gained: Float, keep: float, begin: float) -> Float:
     return np.array(list(states)[1:])
 
 
-def settled_degC(camera: Camera, air_degC: float) -> Float:
+def compute_settled_degC(camera: Camera, air_degC: float) -> Float:
     """(5,): a powered camera after a long time."""
     return np.asarray(np.linalg.solve(-camera.rates, camera.to_air * air_degC + camera.heat_K_per_s), np.float64)
 
 
-def lagged(values: Float, tau_s: float) -> Float:
+def apply_lag(values: Float, tau_s: float) -> Float:
     """First order, beginning in equilibrium."""
     keep = float(np.exp(-STEP_S / tau_s))
     return _first_order(values * (1 - keep), keep, float(values[0]))
 
 
-def moved_px(camera: Camera, nodes: Float, rng: np.random.Generator, changes: NDArray[np.int64]) -> Float:
+def compute_motion_px(camera: Camera, nodes: Float, rng: np.random.Generator, changes: NDArray[np.int64]) -> Float:
     """(K, 2): how far the whole image has moved by sag, plays, creep and what does not repeat. changes: the indices at
     which the chamber was given another set-point."""
-    away_K = nodes - settled_degC(camera, REFERENCE_DEGC)
+    away_K = nodes - compute_settled_degC(camera, REFERENCE_DEGC)
     total = np.zeros((len(nodes), 2))
     effects = camera.effects
     if effects.sag:
@@ -207,9 +207,9 @@ def moved_px(camera: Camera, nodes: Float, rng: np.random.Generator, changes: ND
         total += down * camera.sag_px * np.expm1(away_K[:, CELL] / camera.sag_K)[:, None]
     if effects.dead_zone:
         for half_K, weight in zip(camera.play_K, camera.play_px_per_K, strict=True):
-            total += np.array(list(_play(away_K[:, MOUNT], half_K)))[:, None] * weight
+            total += np.array(list(_apply_backlash(away_K[:, MOUNT], half_K)))[:, None] * weight
     if effects.creep:
-        total += lagged(away_K[:, CELL], camera.creep_s)[:, None] * camera.creep_px_per_K
+        total += apply_lag(away_K[:, CELL], camera.creep_s)[:, None] * camera.creep_px_per_K
     if effects.stick_slip:
         total += np.array(list(_slips(away_K[:, BODY], camera.slip_K, rng)))[:, None] * camera.slip_px_per_K
     if effects.unrepeated:
@@ -217,7 +217,7 @@ def moved_px(camera: Camera, nodes: Float, rng: np.random.Generator, changes: ND
     return total
 
 
-def _play(driver: Float, half: float) -> Iterator[float]:
+def _apply_backlash(driver: Float, half: float) -> Iterator[float]:
     place = float(driver[0])
     for push in driver.tolist():
         place = min(max(place, push - half), push + half)
@@ -242,7 +242,7 @@ def _fixings(camera: Camera, rng: np.random.Generator, count: int, changes: NDAr
     for begin, end in zip(changes, [*changes[1:], count], strict=True):
         place = 0.6 * place + 0.8 * camera.fixing_px * rng.standard_normal(2)
         wanted[begin:end] = place
-    return np.stack([lagged(wanted[:, axis], 1200.0) for axis in (0, 1)], axis=1)
+    return np.stack([apply_lag(wanted[:, axis], 1200.0) for axis in (0, 1)], axis=1)
 
 
 def target_mm(linear_mm: float = 0.0, rotary_deg: float = 0.0) -> Float:
@@ -255,7 +255,7 @@ def target_mm(linear_mm: float = 0.0, rotary_deg: float = 0.0) -> Float:
 def centres_px(camera: Camera, nodes: Float, moved: Float, place_mm: Float | None = None) -> Float:
     """(K, 54, 2): where the discs are seen, with temperatures (K, 5) and motions (K, 2); place_mm (54, 3): where they
     are, by default `target_mm()`."""
-    away_K = nodes - settled_degC(camera, REFERENCE_DEGC)
+    away_K = nodes - compute_settled_degC(camera, REFERENCE_DEGC)
     bent = away_K * (1 + camera.bend_per_K * away_K)
     place_mm = target_mm() if place_mm is None else place_mm
     world = place_mm[:, :2] / place_mm[:, 2:]
@@ -278,7 +278,7 @@ def sensor_degC(camera: Camera, nodes: Float, powered: Float) -> Float:
     chip = nodes[:, CHIP]
     stated = np.round(chip / 0.1) * 0.1
     if camera.effects.coarse_sensor:
-        stated = np.round((lagged(chip, camera.sensor_lag_s) + camera.sensor_offset_K) / 0.5) * 0.5
+        stated = np.round((apply_lag(chip, camera.sensor_lag_s) + camera.sensor_offset_K) / 0.5) * 0.5
     return np.where(powered > 0, stated, np.nan)
 
 
@@ -286,5 +286,5 @@ def air_near_degC(camera: Camera, air_degC: Float, rng: np.random.Generator) -> 
     """(K,): what the stand's thermometer tells of the air."""
     stated = air_degC
     if camera.effects.far_air:
-        stated = REFERENCE_DEGC + camera.air_share * (lagged(air_degC, camera.air_lag_s) - REFERENCE_DEGC)
+        stated = REFERENCE_DEGC + camera.air_share * (apply_lag(air_degC, camera.air_lag_s) - REFERENCE_DEGC)
     return stated + 0.003 * rng.standard_normal(len(air_degC))

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.facts import ModelFacts
-from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, exponents
+from thermostand.compensation.drift.model_facts import ModelFacts
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, list_exponents
 from thermostand.compensation.drift.terms import (
     AmbientLag,
     AmbientLagCubed,
     AmbientLagSquared,
+    BacklashTerm,
     CameraLag,
+    CameraSquaredTerm,
+    CameraTerm,
     ConstantTerm,
-    OfCamera,
-    OfCameraSquared,
-    OfPartPlay,
-    OfPlay,
+    HiddenBacklashTerm,
 )
 from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange
 
@@ -36,7 +36,7 @@ FACTS = {
 
 
 def paper(degree: int = 3) -> PaperModel:
-    rng, count = np.random.default_rng(degree), len(exponents(degree))
+    rng, count = np.random.default_rng(degree), len(list_exponents(degree))
     score = DegreeScore(
         degree=degree, terms=count, condition=9.0, rms_px=(0.1, 0.1), fold_chamber_degC=(), fold_rms_px=()
     )
@@ -54,12 +54,12 @@ def paper(degree: int = 3) -> PaperModel:
 def thermal(*, warmed: bool = True) -> ThermalModel:
     """With a term of every kind."""
     terms = (
-        *(ConstantTerm(), OfCamera(), OfCameraSquared()),
+        *(ConstantTerm(), CameraTerm(), CameraSquaredTerm()),
         *(AmbientLag(tau_s=tau_s) for tau_s in (600.0, 3600.0)),
         *(AmbientLagSquared(tau_s=3600.0), AmbientLagCubed(tau_s=3600.0), CameraLag(tau_s=600.0)),
-        *(OfPlay(radius_K=6.0), OfPlay(radius_K=3.0)),
-        OfPartPlay(radius_K=2.0, tau_s=3600.0, share=0.3),
-        OfPartPlay(radius_K=1.0, tau_s=600.0, share=0.1),
+        *(BacklashTerm(radius_K=6.0), BacklashTerm(radius_K=3.0)),
+        HiddenBacklashTerm(radius_K=2.0, tau_s=3600.0, share=0.3),
+        HiddenBacklashTerm(radius_K=1.0, tau_s=600.0, share=0.1),
     )
     rng = np.random.default_rng(7)
     return ThermalModel(

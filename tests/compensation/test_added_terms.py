@@ -9,22 +9,29 @@ import numpy as np
 import pytest
 
 from tests.installed import install
-from thermostand.compensation.apply.runtime_export import export, export_c
-from thermostand.compensation.design.next_visit import Wanted, after, at_rest, decide, now, surroundings
+from thermostand.compensation.apply.runtime_export import export_c, export_runtime
+from thermostand.compensation.design.next_visit import (
+    DesignGoal,
+    compute_equilibrium,
+    decide,
+    fit_surroundings,
+    forecast,
+    read_current_state,
+)
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.terms import TERMS
-from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_fit import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift_runtime import Drift
 from thermostand.compensation.drift_runtime import compiled as worked_out
-from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, in_c, in_words, lag, play
-from thermostand.compensation.history.thermal_history import States, row_of, state_of
-from thermostand.compensation.reporting.numbers import formula_of
+from thermostand.compensation.expression import AIR, CAMERA, POWER, Origin, away, backlash, format_c, format_words, lag
+from thermostand.compensation.history.thermal_history import States, make_initial_state, read_state_row
+from thermostand.compensation.reporting.report_numbers import describe_formula
 from thermostand.foundation.errors import ConfigError, SessionError
 
-from .compiled_header import COMPILER, compiled, said
-from .drawn_cameras import drawn_camera
-from .drawn_nights import Night, Stretch, night, reference, warm_up
+from .compiled_header import COMPILER, compile_header, run_header
+from .drawn_cameras import draw_camera
+from .drawn_sessions import DrawnSession, Stretch, record_session, reference, warm_up
 from .made_up_models import LIFE
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "tube-term"
@@ -47,12 +54,12 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def seen(tube: None) -> Night:
-    return night(drawn_camera(3), [*warm_up(), *reference(), *VISITS])
+def seen(tube: None) -> DrawnSession:
+    return record_session(draw_camera(3), [*warm_up(), *reference(), *VISITS])
 
 
 @pytest.fixture(scope="module")
-def model(seen: Night) -> ThermalModel:
+def model(seen: DrawnSession) -> ThermalModel:
     return fit_thermal(seen.observed)
 
 
@@ -78,14 +85,14 @@ def test_a_fit_has_it_and_a_file_keeps_it(model: ThermalModel, tmp_path: Path):
 
 
 def test_the_report_s_formula_has_it(model: ThermalModel):
-    formula = formula_of(model)
+    formula = describe_formula(model)
     assert formula.terms[added(model)[0]] == "(lag(camera(11.6667 min), 5 min) − air(11.6667 min)) supply(20 min)"
     assert formula.coefficients_px.shape == (len(model.terms), 8)
 
 
 def test_the_run_time_and_the_header_have_it(model: ThermalModel, tmp_path: Path):
-    export(model, tmp_path)
-    drift, state = Drift.load(tmp_path / "drift.json"), state_of(model.memory)
+    export_runtime(model, tmp_path)
+    drift, state = Drift.load(tmp_path / "drift.json"), make_initial_state(model.memory)
     places = model.facts.reference_centres_px[:6]
     corrected, flags = [], []
     for sample in LIFE:
@@ -93,25 +100,29 @@ def test_the_run_time_and_the_header_have_it(model: ThermalModel, tmp_path: Path
         state.advance(*sample)
         corrected.append(drift.correct(places))
         flags.append(drift.flags(places))
-    here = States(model.memory, row_of(state)[None])
+    here = States(model.memory, read_state_row(state)[None])
     np.testing.assert_allclose(corrected[-1], model.correct(places, here), rtol=0, atol=1e-9)
     if COMPILER is not None:
-        c = said(compiled(export_c(model, tmp_path / "drift.h")), places, np.array(LIFE), model.facts.image_size)
+        c = run_header(
+            compile_header(export_c(model, tmp_path / "drift.h")), places, np.array(LIFE), model.facts.image_size
+        )
         np.testing.assert_allclose(c.corrected_px, corrected, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(c.flags, flags)
 
 
-def test_the_forecast_has_it(seen: Night, model: ThermalModel):
-    around = surroundings(seen.observed, ramp_K_per_min=20.0)
+def test_the_forecast_has_it(seen: DrawnSession, model: ThermalModel):
+    around = fit_surroundings(seen.observed, ramp_K_per_min=20.0)
     inner = [part for part in model.memory.parts if part[0] == "lag" and part[1] not in (AIR, CAMERA, POWER)]
     assert len(inner) == 2
-    long = after(around, now(seen.observed, model.memory), np.array([40.0]), np.full(1, 12 * 3600.0)).states
-    rest = at_rest(around, np.array([40.0]), model.memory).states
+    long = forecast(
+        around, read_current_state(seen.observed, model.memory), np.array([40.0]), np.full(1, 12 * 3600.0)
+    ).states
+    rest = compute_equilibrium(around, np.array([40.0]), model.memory).states
     assert long.of(inner) == pytest.approx(rest.of(inner), abs=0.01)
-    assert decide(seen.observed, Wanted((10.0, 52.0), 1e-4)).reason.startswith("the residual is predicted")
+    assert decide(seen.observed, DesignGoal((10.0, 52.0), 1e-4)).reason.startswith("the residual is predicted")
 
 
-def test_a_package_that_is_broken_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen: Night):
+def test_a_package_that_is_broken_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seen: DrawnSession):
     monkeypatch.syspath_prepend(tmp_path)
     install(tmp_path, "acme-none", {}, {"thermostand.drift_terms": "none = acme_none:No"}, "2.0")
     with pytest.raises(ConfigError, match=r"none: acme-none 2.0 cannot be loaded.*reinstall it"):
@@ -130,14 +141,14 @@ def test_a_package_that_is_broken_is_named(tmp_path: Path, monkeypatch: pytest.M
 )
 def test_an_expression_in_words_in_c_and_as_a_number(feature, words: str, c: str | None, value: float):
     at = {CAMERA: 0, AIR: 1, POWER: 2, lag(POWER, 60.0): 3}
-    bound = Origin(44.0, 24.0).bound(feature)
-    assert in_words(feature) == words
+    bound = Origin(44.0, 24.0).bind(feature)
+    assert format_words(feature) == words
     assert worked_out(bound, at)([34.0, 24.0, 1.0, 0.0]) == value
-    written = in_c(bound, {part: f"x[{place}]" for part, place in at.items()})
+    written = format_c(bound, {part: f"x[{place}]" for part, place in at.items()})
     assert c is None or written == c
     assert eval(written, {}, {"x": [34.0, 24.0, 1.0, 0.0]}) == pytest.approx(value)
 
 
 def test_what_is_no_expression_is_refused():
     with pytest.raises(ValueError, match="no expression"):
-        worked_out(play(CAMERA, 3.0), {CAMERA: 0})
+        worked_out(backlash(CAMERA, 3.0), {CAMERA: 0})

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app
 from thermostand.compensation.drift.model_file import load_model, save_model
-from thermostand.compensation.drift.training import frame_states
-from thermostand.compensation.history.thermal_history import recorded_history, states_at
-from thermostand.compensation.observations import observe, session_target
+from thermostand.compensation.drift.training_data import compute_frame_states
+from thermostand.compensation.history.thermal_history import compute_states_at, read_history
+from thermostand.compensation.observations import observe, read_session_target
 from thermostand.experiments.steps import Role
 from thermostand.markers.detection import detect
 from thermostand.recording.reading.session import Session
@@ -71,7 +71,7 @@ def test_the_markers_of_a_session_are_corrected_with_its_recorded_states(
         frames = list(session.frames())
         times_ns = np.array([frame.time_ns for frame in frames])
         camera_degC = np.array([frame.camera_degC for frame in frames])
-        states = states_at(recorded_history(session), model.memory, times_ns, camera_degC)
+        states = compute_states_at(read_history(session), model.memory, times_ns, camera_degC)
         for index in (4, 8, 15):
             row = rows[54 * index + 7]
             place = np.array([[float(row["x_px"]), float(row["y_px"])]])
@@ -86,7 +86,7 @@ def test_images_of_a_session_show_the_target_where_the_model_puts_it(
     run("apply", files["paper"], recorded.path, "-o", out, "--frames", "6:8")
     index = table(out / "images.csv")
     assert [(row["image"], row["frame"]) for row in index] == [("000006.tiff", "6"), ("000007.tiff", "7")]
-    target = session_target(session)
+    target = read_session_target(session)
     for number in (6, 7):
         frame = session.frame(number)
         image = cv2.imread(str(out / f"{number:06d}.tiff"), cv2.IMREAD_UNCHANGED)
@@ -199,7 +199,7 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     assert "thermal: " in run("rereference", tmp_path / "elsewhere.json", recorded.path, "-o", tmp_path / "here.json")
     here, observed = load_model(tmp_path / "here.json"), observe(recorded.path)
     assert (here.form, here.other) == ("thermal", None)
-    states = frame_states(observed, here.memory)
+    states = compute_frame_states(observed, here.memory)
     at_reference = np.flatnonzero(observed.of(Role.REFERENCE)).tolist()
     corrected = [here.correct(recorded.true_px[k], states.where(np.array([k]))) for k in at_reference]
     assert np.abs(np.mean(corrected, axis=0) - at_first_px).max() < 0.02

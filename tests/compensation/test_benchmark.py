@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.benchmark.__main__ import loaded, write
+from tests.benchmark.__main__ import load_method, write
+from tests.benchmark.benchmark_cases import GROUPS, TASKS, TRAININGS, Case, make_case
 from tests.benchmark.methods import METHODS
-from tests.benchmark.nights import GROUPS, TASKS, TRAININGS, Case, case
-from tests.benchmark.scoring import scores, table
+from tests.benchmark.scoring import format_table, score_method
 
 LONG = ("the form that is chosen", "and a GP on its residual")
 """These fit the others first."""
@@ -19,7 +19,7 @@ EXAMPLE = Path(__file__).parents[1] / "benchmark" / "example_method.py"
 
 @pytest.fixture(scope="module")
 def one() -> Case:
-    return case(GROUPS[1], 0, TRAININGS[1])
+    return make_case(GROUPS[1], 0, TRAININGS[1])
 
 
 def test_the_frames_that_are_asked_for_have_no_centres_and_the_truth_no_noise(one: Case):
@@ -36,7 +36,7 @@ def test_the_frames_that_are_asked_for_have_no_centres_and_the_truth_no_noise(on
 
 
 def test_it_is_the_same_on_every_run(one: Case):
-    again = case(GROUPS[1], 0, TRAININGS[1])
+    again = make_case(GROUPS[1], 0, TRAININGS[1])
     assert np.array_equal(one.training.centres_px, again.training.centres_px, equal_nan=True)
     for first, second in zip(one.questions, again.questions, strict=True):
         assert np.array_equal(first.seen_px, second.seen_px)
@@ -44,10 +44,10 @@ def test_it_is_the_same_on_every_run(one: Case):
 
 def test_a_method_of_one_s_own_is_one_short_file_and_beats_doing_nothing(one: Case):
     assert len(EXAMPLE.read_text().splitlines()) <= 100
-    name, method = loaded(EXAMPLE)
-    plain, own = (scores(*each, one) for each in (("nothing", METHODS["nothing"]), (name, method)))
+    name, method = load_method(EXAMPLE)
+    plain, own = (score_method(*each, one) for each in (("nothing", METHODS["nothing"]), (name, method)))
     assert all(score.rms_mpx < before.rms_mpx / 3 for score, before in zip(own, plain, strict=True))
-    printed = table([*plain, *own], {"nothing": METHODS["nothing"], name: method})
+    printed = format_table([*plain, *own], {"nothing": METHODS["nothing"], name: method})
     assert f"1 cameras, {GROUPS[1]}" in printed
     assert "of affine motions |" in printed
 
@@ -56,7 +56,7 @@ def test_a_method_of_one_s_own_is_one_short_file_and_beats_doing_nothing(one: Ca
     "name", [pytest.param(name, marks=[pytest.mark.nightly] if name in LONG else []) for name in METHODS]
 )
 def test_a_method_answers_and_one_with_intervals_says_them(one: Case, name: str):
-    found = scores(name, METHODS[name], one)
+    found = score_method(name, METHODS[name], one)
     assert np.isfinite([score.rms_mpx for score in found]).all()
     assert np.isfinite(found[0].covered) == (name != "nothing")
     if name in LONG:

@@ -17,16 +17,16 @@ from thermostand.compensation.budget.budget import (
     KELVIN,
     Budget,
     Index,
-    budget,
+    average_states,
     ciddor_1996,
-    displacement_px,
+    compute_budget,
+    compute_displacement_px,
+    compute_granite_mm,
+    compute_post_mm,
+    compute_saturation_Pa,
     edlen_1966,
-    granite_mm,
-    home_residuals,
-    mean_state,
-    post_mm,
-    saturation_Pa,
-    varied,
+    measure_home_repeatability,
+    vary_inputs,
 )
 from thermostand.compensation.budget.geometry import Geometry, ThermometerState, load_geometry
 from thermostand.drivers.sim.physics import optics
@@ -35,26 +35,26 @@ from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.target import load_target
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 from .conftest import record_items
-from .rendered import Scene, photograph, render
+from .renderer import Scene, photograph, render
 
 PAPER = load_geometry("paper")
-TARGET = load_target(packaged("targets", "paper-9x6"))
+TARGET = load_target(find_packaged("targets", "paper-9x6"))
 COOL = ThermometerState(24.0, 24.0, 24.0, 24.0, 24.0)
 CENTRE_px = np.array([1223.5, 1023.5])
 CORNER_px = np.array([2447.0, 2047.0])
 
 
 def moved_px(xy_px: np.ndarray, geometry: Geometry = PAPER, **degC: float) -> np.ndarray:
-    return displacement_px(replace(COOL, **degC), COOL, geometry, xy_px)
+    return compute_displacement_px(replace(COOL, **degC), COOL, geometry, xy_px)
 
 
 def test_granite_inside_warmer_by_30_K_scales_the_image_by_75_ppm_and_the_post_lowers_it():
     warm = replace(COOL, granite_inside_degC=54.0)
-    assert 1e3 * granite_mm(warm, COOL, PAPER) == pytest.approx(62, abs=0.05)
-    assert 1e3 * post_mm(warm, COOL, PAPER) == pytest.approx(15)
+    assert 1e3 * compute_granite_mm(warm, COOL, PAPER) == pytest.approx(62, abs=0.05)
+    assert 1e3 * compute_post_mm(warm, COOL, PAPER) == pytest.approx(15)
     at_centre, at_corner = moved_px(np.array([CENTRE_px, CORNER_px]), granite_inside_degC=54.0)
     assert at_centre == pytest.approx([0, 0.1316], abs=1e-3)
     assert np.linalg.norm(at_corner - at_centre) == pytest.approx(0.12, abs=0.001)
@@ -87,17 +87,17 @@ def test_the_correction_takes_out_what_the_simulated_stand_does():
     geometry = PAPER.model_copy(update={"target_per_K": PAPER.target_per_K.model_copy(update={"value": 9.0e-6})})
     cool_nodes = optics.Nodes(24.0, 24.0, 24.0, 24.0, 24.0, 24.0)
     warm_nodes = replace(cool_nodes, granite_inside_degC=50.0, granite_outside_degC=27.0, artifact_degC=25.5)
-    cool = optics.optics_at("modified", cool_nodes, optics.StandPlacement())
-    warm = optics.optics_at("modified", warm_nodes, optics.StandPlacement())
+    cool = optics.compute_optics_at("modified", cool_nodes, optics.StandPlacement())
+    warm = optics.compute_optics_at("modified", warm_nodes, optics.StandPlacement())
     stand_only = replace(
         cool,
         camera_shift_mm=warm.camera_shift_mm,
         target_centre_mm=warm.target_centre_mm,
         target_scale=warm.target_scale,
     )
-    before, after = optics.true_centres_px(cool), optics.true_centres_px(stand_only)
+    before, after = optics.compute_true_centres_px(cool), optics.compute_true_centres_px(stand_only)
     state = replace(COOL, granite_inside_degC=50.0, granite_outside_degC=27.0, artifact_degC=25.5)
-    left = after - displacement_px(state, COOL, geometry, after) - before
+    left = after - compute_displacement_px(state, COOL, geometry, after) - before
     assert np.abs(after - before).max() > 0.15
     assert np.abs(left).max() < 0.010  # the simulated granite expands 5 % more in the warm
     assert (np.abs(left) < 2 * sigma_px(state, COOL, geometry, after) + 1e-4).all()
@@ -105,8 +105,10 @@ def test_the_correction_takes_out_what_the_simulated_stand_does():
 
 def sigma_px(state: ThermometerState, reference: ThermometerState, geometry: Geometry, xy_px: np.ndarray) -> np.ndarray:
     """Of the displacement: every uncertain input larger in turn, as a validation does."""
-    nominal = displacement_px(state, reference, geometry, xy_px)
-    moved = [displacement_px(each, reference, other, xy_px) - nominal for each, other in varied(state, geometry)]
+    nominal = compute_displacement_px(state, reference, geometry, xy_px)
+    moved = [
+        compute_displacement_px(each, reference, other, xy_px) - nominal for each, other in vary_inputs(state, geometry)
+    ]
     return np.sqrt(np.square(moved).sum(axis=0))
 
 
@@ -116,7 +118,7 @@ def test_the_uncertainty_is_that_of_its_inputs():
     exact = PAPER.model_copy(update={**sure, "thermometer_K": 0.0, "granite_gradient_K": 0.0})
     assert sigma_px(warm, COOL, exact, CORNER_px) == pytest.approx([0, 0])
     loose = exact.model_copy(update={"granite_per_K": PAPER.granite_per_K})
-    tenth = 0.1 * np.abs(displacement_px(warm, COOL, exact, CORNER_px))
+    tenth = 0.1 * np.abs(compute_displacement_px(warm, COOL, exact, CORNER_px))
     assert sigma_px(warm, COOL, loose, CORNER_px) == pytest.approx(tenth, rel=1e-6)
 
 
@@ -124,9 +126,11 @@ QUANTITIES = [name for name in Geometry.model_fields if hasattr(getattr(PAPER, n
 
 
 def test_means_leave_out_what_is_unknown():
-    mean = mean_state([COOL, replace(COOL, air_degC=30.0), replace(COOL, air_degC=math.nan, artifact_degC=math.nan)])
+    mean = average_states(
+        [COOL, replace(COOL, air_degC=30.0), replace(COOL, air_degC=math.nan, artifact_degC=math.nan)]
+    )
     assert (mean.air_degC, mean.artifact_degC) == (27.0, 24.0)
-    assert math.isnan(mean_state([replace(COOL, air_degC=math.nan)]).air_degC)
+    assert math.isnan(average_states([replace(COOL, air_degC=math.nan)]).air_degC)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +145,7 @@ def test_means_leave_out_what_is_unknown():
 )
 def test_a_wrong_geometry_gets_a_sentence(line: str, message: str, tmp_path: Path):
     key = line.partition(":")[0]
-    geometry = packaged("", "simulated").parent / "geometry" / "paper.yaml"
+    geometry = find_packaged("", "simulated").parent / "geometry" / "paper.yaml"
     kept = [old for old in geometry.read_text().splitlines() if not old.startswith(f"{key}:")]
     path = tmp_path / "stand.yaml"
     path.write_text("\n".join([*kept, line]))
@@ -157,7 +161,7 @@ def test_home_checks_are_read_from_the_recorded_events():
         ("homed", {"axis": "linear"}),
     ]
     events = [Event(0, "info", kind, "as its data say", data) for kind, data in found]
-    linear, rotary = home_residuals(events, "mm"), home_residuals(events, "deg")
+    linear, rotary = measure_home_repeatability(events, "mm"), measure_home_repeatability(events, "deg")
     assert (linear.count, rotary.count) == (2, 1)
     assert linear.rms == pytest.approx(math.sqrt((9 + 16) / 2) * 1e-3)
     assert rotary.rms == pytest.approx(0.005)
@@ -196,7 +200,7 @@ def published(number: int, time_ns: int) -> Iterator[Item]:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sessions") / "night"
-    attachments = {"target.yaml": packaged("targets", "paper-9x6").read_text()}
+    attachments = {"target.yaml": find_packaged("targets", "paper-9x6").read_text()}
     how = {"session_id": "night", "recipe": "validation", "attachments": attachments}
     asyncio.run(record_items(path, published, 2 * len(CAPTURES), 30, **how))
     return path
@@ -204,7 +208,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(session: Path) -> Budget:
-    return budget(Session.open(session), TARGET, PAPER)
+    return compute_budget(Session.open(session), TARGET, PAPER)
 
 
 def test_a_sessions_budget_has_each_part_at_its_largest(found: Budget):
@@ -281,16 +285,18 @@ def test_dry_air_at_550_nm(degC: float):
 )
 def test_dry_and_half_saturated_air_at_633_nm(equation: Index, dry: float, half_saturated: float):
     assert equation(20.0, 101325.0, 0.0, 0.633) == pytest.approx(dry, abs=6e-11)
-    assert equation(20.0, 101325.0, 0.5 * saturation_Pa(20.0), 0.633) == pytest.approx(half_saturated, abs=6e-11)
+    assert equation(20.0, 101325.0, 0.5 * compute_saturation_Pa(20.0), 0.633) == pytest.approx(
+        half_saturated, abs=6e-11
+    )
 
 
 @pytest.mark.parametrize(("degC", "pascal"), [(26.85, 3536.58941), (226.85, 2638897.76), (0.01, 611.657)])
 def test_saturation_pressure_agrees_with_the_iapws_tables(degC: float, pascal: float):
-    assert saturation_Pa(degC) == pytest.approx(pascal, rel=1e-5)
+    assert compute_saturation_Pa(degC) == pytest.approx(pascal, rel=1e-5)
 
 
 def test_heat_pressure_and_humidity_move_the_index_as_known():
     at = ciddor_1996(24.0, 101325.0, 0.0, 0.55)
     assert ciddor_1996(25.0, 101325.0, 0.0, 0.55) - at == pytest.approx(-9.1e-7, rel=0.01)
     assert ciddor_1996(24.0, 101425.0, 0.0, 0.55) - at == pytest.approx(2.7e-7, rel=0.02)
-    assert ciddor_1996(24.0, 101325.0, 0.5 * saturation_Pa(24.0), 0.55) - at == pytest.approx(-5.3e-7, rel=0.03)
+    assert ciddor_1996(24.0, 101325.0, 0.5 * compute_saturation_Pa(24.0), 0.55) - at == pytest.approx(-5.3e-7, rel=0.03)

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.compensation import plant_night
-from tests.compensation.drawn_cameras import REPEATING, drawn_camera
-from tests.compensation.drawn_nights import followed_cycle, full_night, night, reference, warm_up
+from tests.compensation import plant_sessions
+from tests.compensation.drawn_cameras import REPEATING, draw_camera
+from tests.compensation.drawn_sessions import make_followed_cycle, make_full_session, record_session, reference, warm_up
 from thermostand.compensation.drift.bumps import find_bumps
-from thermostand.compensation.drift.facts import Bump
+from thermostand.compensation.drift.model_facts import Bump
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 
@@ -27,15 +27,17 @@ _NEAR_NS = 3_000 * 1_000_000_000
 
 
 def laboratory(seed: int) -> Observations:
-    return plant_night.night("modified", seed, plant_night.warm_up_and_cycles())[0]
+    return plant_sessions.record_plant_session("modified", seed, plant_sessions.warm_up_and_cycles())[0]
 
 
 def at_rest(seed: int) -> Observations:
-    return night(drawn_camera(seed, *_effects(seed)), full_night(), seed).observed
+    return record_session(draw_camera(seed, *_effects(seed)), make_full_session(), seed).observed
 
 
 def on_the_way(seed: int) -> Observations:
-    return night(drawn_camera(seed, *_effects(seed)), [*warm_up(), *reference(), *followed_cycle()], seed).observed
+    return record_session(
+        draw_camera(seed, *_effects(seed)), [*warm_up(), *reference(), *make_followed_cycle()], seed
+    ).observed
 
 
 def _effects(seed: int) -> list[str]:

@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.nightly import by_night
-from thermostand.compensation.apply.compensate_images import warp
-from thermostand.compensation.apply.runtime_export import export_c, header_text, runtime_model
-from thermostand.compensation.drift.choosing import fit
+from tests.nightly import mark_nightly
+from thermostand.compensation.apply.image_correction import warp
+from thermostand.compensation.apply.runtime_export import build_runtime_model, export_c, render_header
 from thermostand.compensation.drift.drift_model import DriftModel
+from thermostand.compensation.drift.model_selection import fit
 from thermostand.compensation.drift_runtime import AMBIENT, CAMERA, HISTORY, STATE, SWITCHED_ON, Drift
 from thermostand.foundation.errors import ConfigError
 
-from .compiled_header import COMPILER, STRICT, Float, compiled, said
-from .drawn_cameras import drawn_camera
-from .drawn_nights import full_night, night
+from .compiled_header import COMPILER, STRICT, Float, compile_header, run_header
+from .drawn_cameras import draw_camera
+from .drawn_sessions import make_full_session, record_session
 from .made_up_models import LIFE, POINTS, SIZE, paper, thermal
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
@@ -46,14 +46,14 @@ def program_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
 
     @cache
     def build(name: str) -> Path:
-        return compiled(export_c(MODELS[name], tmp_path_factory.mktemp("header") / "drift.h"))
+        return compile_header(export_c(MODELS[name], tmp_path_factory.mktemp("header") / "drift.h"))
 
     return build
 
 
 def followed(model: DriftModel, samples: Float, points_px: Float) -> tuple[Drift, Float, Float]:
     """The Python module after them, its corrections (S, N, 2) and flags (S, N)."""
-    drift = Drift(dict(runtime_model(model)))
+    drift = Drift(dict(build_runtime_model(model)))
     corrected, flags = [], []
     for sample in samples.tolist():
         drift.advance(*sample)
@@ -62,11 +62,11 @@ def followed(model: DriftModel, samples: Float, points_px: Float) -> tuple[Drift
     return drift, np.array(corrected), np.array(flags)
 
 
-@pytest.mark.parametrize("name", [by_night("P1"), by_night("P4"), "P5", "thermal", "never switched on"])
+@pytest.mark.parametrize("name", [mark_nightly("P1"), mark_nightly("P4"), "P5", "thermal", "never switched on"])
 def test_it_corrects_and_flags_as_the_module_at_every_instant(name: str, program_of: Callable[[str], Path]):
     samples = np.array(LIFE, float)
     drift, corrected, flags = followed(MODELS[name], samples, SOME)
-    c = said(program_of(name), SOME, samples, SIZE)
+    c = run_header(program_of(name), SOME, samples, SIZE)
     np.testing.assert_allclose(c.corrected_px, corrected, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(c.flags, flags)
     shift = corrected - SOME
@@ -77,7 +77,7 @@ def test_it_corrects_and_flags_as_the_module_at_every_instant(name: str, program
 
 @pytest.mark.nightly
 def test_a_fitted_model_follows_a_whole_night_as_the_module_does(tmp_path: Path):
-    made = night(drawn_camera(1003, "creep", "dead_zone"), full_night())
+    made = record_session(draw_camera(1003, "creep", "dead_zone"), make_full_session())
     model, history = fit(made.observed), made.observed.histories[0]
     since_s = (history.ambient_ns - history.ambient_ns[0]) / 1e9
     powered = history.powered[np.searchsorted(history.powered_ns, history.ambient_ns, side="right") - 1]
@@ -86,7 +86,7 @@ def test_a_fitted_model_follows_a_whole_night_as_the_module_does(tmp_path: Path)
     samples = np.column_stack([np.diff(since_s, prepend=-10.0), history.ambient_degC, powered, camera])
     places = model.facts.reference_centres_px[:8]
     drift, corrected, flags = followed(model, samples, places)
-    c = said(compiled(export_c(model, tmp_path / "drift.h")), places, samples, model.facts.image_size)
+    c = run_header(compile_header(export_c(model, tmp_path / "drift.h")), places, samples, model.facts.image_size)
     np.testing.assert_allclose(c.corrected_px, corrected, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(c.flags, flags)
     assert model.form == "thermal"
@@ -121,7 +121,7 @@ def test_whatever_it_is_fed_it_does_as_the_module_and_nothing_undefined(
     places = np.concatenate([SOME[:4], np.random.default_rng(seed).choice(odd, (12, 2))])
     with np.errstate(all="ignore"):
         _, corrected, flags = followed(MODELS[name], samples, places)
-    c = said(program_of(name), places, samples, SIZE)
+    c = run_header(program_of(name), places, samples, SIZE)
     np.testing.assert_array_equal(c.flags, flags)
     moderate = np.abs(corrected[:, :4]) < 1e5  # beyond it the temperature was none that an image could survive
     np.testing.assert_allclose(c.corrected_px[:, :4][moderate], corrected[:, :4][moderate], rtol=1e-9, atol=1e-6)
@@ -133,16 +133,16 @@ def test_whatever_it_is_fed_it_does_as_the_module_and_nothing_undefined(
 
 def test_what_is_unknown_is_flagged_and_has_no_value(program_of: Callable[[str], Path]):
     gap = np.array([[1.0, math.nan, 1.0, 44.0], [1.0, 24.0, 2.0, 44.0], [-1.0, 24.0, 1.0, 44.0], [1, 5000.0, 1, 44.0]])
-    c = said(program_of("thermal"), SOME, gap, SIZE)
+    c = run_header(program_of("thermal"), SOME, gap, SIZE)
     assert (c.state_flags == UNKNOWN).all()
     assert np.isnan(c.corrected_px).all()
     assert (c.maps == 0).all()  # untouched
-    c = said(program_of("P5"), SOME, np.array([[1.0, 24.0, 1.0, math.inf], [1.0, math.nan, 1.0, 1e9]]), SIZE)
+    c = run_header(program_of("P5"), SOME, np.array([[1.0, 24.0, 1.0, math.inf], [1.0, math.nan, 1.0, 1e9]]), SIZE)
     assert (c.state_flags == CAMERA).all()
 
 
 def test_the_maps_correct_an_image_as_the_warp_does():
-    drift = Drift(dict(runtime_model(thermal())))
+    drift = Drift(dict(build_runtime_model(thermal())))
     for sample in LIFE:
         drift.advance(*sample)
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
@@ -194,5 +194,5 @@ def test_a_name_that_is_none_in_c_is_refused(name: str, tmp_path: Path):
 
 
 def test_a_serial_number_cannot_end_the_comment():
-    model = {**runtime_model(paper(1)), "camera_serial": "a */ #error \n b"}
-    assert "camera a ?? ?error ? b," in header_text(model)
+    model = {**build_runtime_model(paper(1)), "camera_serial": "a */ #error \n b"}
+    assert "camera a ?? ?error ? b," in render_header(model)

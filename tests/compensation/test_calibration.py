@@ -9,21 +9,38 @@ import pytest
 import yaml
 
 from thermostand.compensation.calibration.adjustment import Adjustment, adjust
-from thermostand.compensation.calibration.board import board_of
-from thermostand.compensation.calibration.calibrate import BROWN, Model, best, calibrate, halves, rays_of
-from thermostand.compensation.calibration.camera_file import camera_file
+from thermostand.compensation.calibration.board import make_board
+from thermostand.compensation.calibration.calibrate import (
+    BROWN,
+    Model,
+    calibrate,
+    compare_halves,
+    fit_ray_lens,
+    select_model,
+)
+from thermostand.compensation.calibration.camera_file import build_camera_file
 from thermostand.compensation.calibration.pinhole import calibrate_opencv
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
-from thermostand.compensation.calibration.uncertainty import NOT_SEEN, difference, projection_uncertainty
-from thermostand.compensation.commands.calibration_cli import summary
-from thermostand.compensation.reporting.pages import calibration_page
-from thermostand.compensation.validation3d.validate import LensModel, camera_of
-from thermostand.drivers.sim.physics.optics import Nodes, Optics, StandPlacement, optics_at, true_centres_px
+from thermostand.compensation.calibration.uncertainty import (
+    NOT_SEEN,
+    compare_calibrations,
+    compute_projection_uncertainty,
+)
+from thermostand.compensation.commands.calibration_cli import format_summary
+from thermostand.compensation.reporting.pages import render_calibration_page
+from thermostand.compensation.validation3d.validate import LensModel, select_lens_model
+from thermostand.drivers.sim.physics.optics import (
+    Nodes,
+    Optics,
+    StandPlacement,
+    compute_optics_at,
+    compute_true_centres_px,
+)
 from thermostand.foundation.errors import CalibrationError
 from thermostand.markers.target import load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 from .calibration_truth import (
     SIZE,
@@ -55,7 +72,7 @@ def adjustments(laboratories: list[Laboratory]) -> list[Adjustment]:
 
 def projection_error_px(adjustment: Adjustment, laboratory: Laboratory, camera: TrueCamera) -> np.ndarray:
     """(P, 54, 2): what the calibrated camera makes of the true target at the true poses, brought into its frame."""
-    rotations, translations = adjustment.poses()
+    rotations, translations = adjustment.compute_poses()
     own = np.einsum("pij,nj->pni", rotations, adjustment.scene.points_mm) + translations[:, None]
     true = np.einsum("pij,nj->pni", laboratory.rotations, laboratory.board_mm) + laboratory.translations_mm[:, None]
     return adjustment.scene.lens.project(own) - camera.project(true)
@@ -96,35 +113,35 @@ def test_board_and_table_are_corrected_beyond_what_was_known_of_them(
 
 
 def test_few_positions_give_a_camera_though_their_halves_give_none(laboratories: list[Laboratory]):
-    few = positions(laboratories[1]).part(np.isin(np.arange(34), np.linspace(0, 33, 4).round()))
+    few = positions(laboratories[1]).select(np.isin(np.arange(34), np.linspace(0, 33, 4).round()))
     found = calibrate(few, target_of(laboratories[1]))
     assert (found.model, found.halves, len(found.not_known)) == (BROWN, None, 1)
-    file = camera_file(found, camera_serial="1", session_ids=("a",), target_name="drawn", software_version="0")
+    file = build_camera_file(found, camera_serial="1", session_ids=("a",), target_name="drawn", software_version="0")
     assert file.uncertainty.halves_rms_px is None
-    assert file.not_known[0] in calibration_page(file, found)
-    assert file.not_known[0] in summary(file, target_of(laboratories[1]))
+    assert file.not_known[0] in render_calibration_page(file, found)
+    assert file.not_known[0] in format_summary(file, target_of(laboratories[1]))
 
 
 def test_of_a_wide_lens_what_nobody_saw_and_rays_that_do_not_describe_it_are_not_given():
     """Polynomials of degree 5 do not follow a lens of 100 deg; its corners are beyond all markers."""
     laboratory = draw(Truth(seed=1, camera=TrueCamera(f_px=1000.0, k1=-0.25, k2=0.1), distance_mm=300.0))
-    few = positions(laboratory).part(np.isin(np.arange(34), np.linspace(0, 33, 5).round()))
+    few = positions(laboratory).select(np.isin(np.arange(34), np.linspace(0, 33, 5).round()))
     few.centres_px[~((few.centres_px > 0) & (few.centres_px < SIZE)).all(axis=2)] = np.nan
     found = calibrate(few, target_of(laboratory), model=Model.BROWN)
     assert found.rays_times > 5
     made = {"camera_serial": "1", "session_ids": ("a",), "target_name": "drawn", "software_version": "0"}
-    file, kept = camera_file(found, **made), camera_file(found, **made, keep_rays=True)
+    file, kept = build_camera_file(found, **made), build_camera_file(found, **made, keep_rays=True)
     assert (file.rays, kept.rays is None, file.rays_doubt) == (None, False, kept.rays_doubt)
-    assert file.rays_doubt in summary(file, target_of(laboratory))
-    assert file.rays_doubt in summary(kept, target_of(laboratory))
+    assert file.rays_doubt in format_summary(file, target_of(laboratory))
+    assert file.rays_doubt in format_summary(kept, target_of(laboratory))
     with pytest.raises(CalibrationError, match="no ray model"):
-        camera_of(file, LensModel.RAYS)
+        select_lens_model(file, LensModel.RAYS)
     sigma_px = np.array(file.uncertainty.sigma_px, np.float64)
     assert np.isnan(sigma_px[[0, 0, -1, -1], [0, -1, 0, -1]]).all()
     assert np.nanmax(sigma_px) < 0.5
     assert file.uncertainty.not_seen == NOT_SEEN
-    assert NOT_SEEN in summary(file, target_of(laboratory))
-    page = calibration_page(file, found)
+    assert NOT_SEEN in format_summary(file, target_of(laboratory))
+    page = render_calibration_page(file, found)
     assert file.rays_doubt in page
     assert "not seen here" in page
 
@@ -152,9 +169,9 @@ def test_a_poses_covariance_is_that_of_its_scatter():
     for _ in range(60):
         centres = exact.validation_px[3] + 0.003 * random.standard_normal((54, 2))
         pose = find_pose(adjustment.scene.lens, adjustment.adjusted_board, centres, covariance)
-        places.append(pose.place_mm(CENTRE_mm))
+        places.append(pose.locate_point_mm(CENTRE_mm))
         chis.append(pose.chi)
-    predicted = np.sqrt(np.diag(pose.covariance_of(CENTRE_mm)))
+    predicted = np.sqrt(np.diag(pose.compute_covariance(CENTRE_mm)))
     assert np.all(np.abs(np.std(places, axis=0) / predicted - 1) < 0.3)
     assert abs(np.mean(chis) - 1) < 0.05
 
@@ -230,7 +247,7 @@ def test_a_lens_that_browns_model_cannot_follow_does_not_bend_the_board():
 def test_the_ray_model_agrees_with_brown_where_brown_is_right(
     laboratories: list[Laboratory], adjustments: list[Adjustment]
 ):
-    rays = rays_of(adjustments[0], 5)
+    rays = fit_ray_lens(adjustments[0], 5)
     errors = translation_errors_um(laboratories[0], rays, adjustments[0].adjusted_board, adjustments[0].scene.table)
     assert np.all(np.abs(errors) < (0.4, 0.4, 2.5))
     pose = find_pose(
@@ -246,7 +263,7 @@ def test_models_are_chosen_by_positions_they_were_not_fitted_to(laboratories: li
     assert found.score(BROWN).rms_px == pytest.approx(0.003, rel=0.12)
     assert found.score("rays, degree 3").rms_px > 0.008
     assert found.score(BROWN).positions == 34
-    assert best(found.scores) == BROWN
+    assert select_model(found.scores) == BROWN
     assert found.rays_times == pytest.approx(1.0, abs=0.1)
     assert found.rays_doubt == ""
 
@@ -256,26 +273,26 @@ def test_the_uncertainty_of_the_projection_covers_the_truth(laboratories: list[L
     nights = [laboratories[0], *(draw(Truth(seed=seed, board_seed=0)) for seed in (11, 12))]
     adjustments = [adjust(positions(night), board(night), TABLE) for night in nights]
     first = adjustments[0]
-    found = projection_uncertainty(first, 826.0)
+    found = compute_projection_uncertainty(first, 826.0)
     assert found.sigma_px.shape == found.pixels.shape[:2]
     middle, corner = found.sigma_px[10, 12], found.sigma_px[0, 0]
     assert 0.0005 < middle < 0.003 < corner < 0.02
-    shifts = np.array([difference(first, other, 826.0).shift_px for other in adjustments[1:]])
+    shifts = np.array([compare_calibrations(first, other, 826.0).shift_px for other in adjustments[1:]])
     normalised = np.linalg.norm(shifts, axis=-1) / (2 * found.sigma_px)
     assert 0.2 < np.sqrt(np.nanmean(normalised**2)) < 2.0
 
 
 def test_the_halves_of_a_session_agree(laboratories: list[Laboratory]):
-    found = halves(positions(laboratories[0]), board(laboratories[0]), TABLE, 826.0, rational=False)
+    found = compare_halves(positions(laboratories[0]), board(laboratories[0]), TABLE, 826.0, rational=False)
     assert 0.0005 < found.rms_px < 0.01
 
 
 def test_positions_that_determine_no_camera_are_refused(laboratories: list[Laboratory]):
     seen = positions(laboratories[0])
-    turned = seen.part(np.abs(seen.rotary_deg) < 1)
+    turned = seen.select(np.abs(seen.rotary_deg) < 1)
     with pytest.raises(CalibrationError, match="the positions span 280 mm and 0 deg"):
         adjust(turned, board(laboratories[0]), TABLE)
-    moved = seen.part(np.abs(seen.linear_mm) < 1)
+    moved = seen.select(np.abs(seen.linear_mm) < 1)
     with pytest.raises(CalibrationError, match="the positions span 0 mm and 60 deg"):
         adjust(moved, board(laboratories[0]), TABLE)
 
@@ -298,11 +315,11 @@ VALIDATION = ((70.0, 0.0), (95.0, 8.0), (10.0, -20.0), (140.0, 22.0))
 
 
 def optics(linear_mm: float, rotary_deg: float) -> Optics:
-    return optics_at("modified", WARM, StandPlacement(linear_mm=linear_mm, rotary_deg=rotary_deg))
+    return compute_optics_at("modified", WARM, StandPlacement(linear_mm=linear_mm, rotary_deg=rotary_deg))
 
 
 def recipe_places() -> np.ndarray:
-    recipe = yaml.safe_load(packaged("recipes", "calibration").read_text())["experiments"][0]["calibration"]
+    recipe = yaml.safe_load(find_packaged("recipes", "calibration").read_text())["experiments"][0]["calibration"]
     left_out = [(entry["linear_mm"], entry["rotary_deg"]) for entry in recipe["left_out"]]
     grid = [(z, angle) for z in recipe["linear_mm"] for angle in recipe["rotary_deg"]]
     return np.array([place for place in grid if place not in left_out], float)
@@ -312,7 +329,7 @@ def test_the_recipes_positions_give_the_stands_camera_and_its_validation_positio
     random = np.random.default_rng(4)
     places = recipe_places()
     assert len(places) == 34
-    centres = np.array([true_centres_px(optics(*place)) for place in places])
+    centres = np.array([compute_true_centres_px(optics(*place)) for place in places])
     covariance = np.tile(NOISE_px**2 * np.eye(2), (34, 54, 1, 1))
     seen = Positions(
         linear_mm=places[:, 0],
@@ -324,7 +341,7 @@ def test_the_recipes_positions_give_the_stands_camera_and_its_validation_positio
         chi=1.0,
         image_size=(2448, 2048),
     )
-    found = adjust(seen, board_of(load_target(packaged("targets", "paper-9x6"))), TableSigma())
+    found = adjust(seen, make_board(load_target(find_packaged("targets", "paper-9x6"))), TableSigma())
     true = optics(0.0, 0.0)
     assert found.reprojection_ratio < 1.05
     assert abs(found.scene.lens.vector[0] - true.f_px) < 4 * found.camera_sigma[0] + 0.01
@@ -333,12 +350,12 @@ def test_the_recipes_positions_give_the_stands_camera_and_its_validation_positio
         [true.sensor_tilt_rad[1], -true.sensor_tilt_rad[0]]
     )
     assert np.all(np.abs(found.scene.lens.vector[2:4] - principal) < 4 * found.camera_sigma[2:4])
-    for lens in (found.scene.lens, rays_of(found, 5)):
+    for lens in (found.scene.lens, fit_ray_lens(found, 5)):
         poses = [
-            find_pose(lens, found.adjusted_board, true_centres_px(optics(*place)), covariance[0])
+            find_pose(lens, found.adjusted_board, compute_true_centres_px(optics(*place)), covariance[0])
             for place in VALIDATION
         ]
-        places_mm = np.array([pose.place_mm(MIDDLE_mm) for pose in poses]) @ found.scene.table.frame.T
+        places_mm = np.array([pose.locate_point_mm(MIDDLE_mm) for pose in poses]) @ found.scene.table.frame.T
         moved_um = 1e3 * (places_mm[1:] - places_mm[0])
         wanted_um = 1e3 * np.array([(0, 0, linear_mm - VALIDATION[0][0]) for linear_mm, _ in VALIDATION[1:]])
         assert np.all(np.abs(moved_um - wanted_um) < (1.0, 1.0, 2.0))

@@ -72,7 +72,7 @@ READERS: dict[str, Callable[[Path], Read]] = {
 def test_every_export_reads_back_to_the_same_projection(lens: Pinhole, tmp_path: Path):
     write_exports(tmp_path, lens, "TS-0001", 0.003)
     assert set(READERS) == set(EXPORTS) == {path.name for path in tmp_path.iterdir()}
-    points = np.column_stack([lens.slopes(PIXELS), np.ones(len(PIXELS))]) * 826
+    points = np.column_stack([lens.compute_slopes(PIXELS), np.ones(len(PIXELS))]) * 826
     for name, reader in READERS.items():
         matrix, distortion, size = reader(tmp_path / name)
         assert size == SIZE
@@ -82,9 +82,9 @@ def test_every_export_reads_back_to_the_same_projection(lens: Pinhole, tmp_path:
 
 
 def test_what_radtan_cannot_hold_is_fitted_not_cut_off():
-    strong = BROWN.stepped(np.array([0, 0, 0, 0, 0, 0, 0, 0, 30.0]))
+    strong = BROWN.apply_step(np.array([0, 0, 0, 0, 0, 0, 0, 0, 30.0]))
     refit = refit_radtan(strong)
-    points = np.column_stack([strong.slopes(PIXELS), np.ones(len(PIXELS))])
+    points = np.column_stack([strong.compute_slopes(PIXELS), np.ones(len(PIXELS))])
     cut = Pinhole(np.append(strong.vector[:8], 0.0), SIZE)
     cut_px = np.abs(cut.project(points) - PIXELS).max()
     off = refit.lens.project(points) - PIXELS

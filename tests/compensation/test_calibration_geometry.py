@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from thermostand.compensation.calibration.adjustment import TableProblem, TableScene, table_from_poses, table_problem
-from thermostand.compensation.calibration.board import Board, shifts_by_camera, shifts_by_homography
-from thermostand.compensation.calibration.least_squares import Float, dense, minimise
-from thermostand.compensation.calibration.pinhole import Pinhole, across
+from thermostand.compensation.calibration.adjustment import TableProblem, TableScene, build_table_problem, fit_table
+from thermostand.compensation.calibration.board import Board, compute_camera_shifts, compute_homography_shifts
+from thermostand.compensation.calibration.least_squares import Float, make_equations, minimise
+from thermostand.compensation.calibration.pinhole import Pinhole, find_perpendiculars
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.rays import fit_rays
 from thermostand.compensation.calibration.stage_geometry import TableSigma
@@ -34,12 +34,12 @@ def test_projections_are_opencvs(lens: Pinhole):
 
 @pytest.mark.parametrize("lens", [BROWN, RATIONAL])
 def test_slopes_undo_projections(lens: Pinhole):
-    assert np.abs(lens.slopes(lens.project(POINTS)) - POINTS[:, :2] / POINTS[:, 2:]).max() < 1e-12
+    assert np.abs(lens.compute_slopes(lens.project(POINTS)) - POINTS[:, :2] / POINTS[:, 2:]).max() < 1e-12
 
 
 def test_slopes_are_nan_where_the_lens_folds_over():
     folding = Pinhole(np.array([500.0, 500, 1000, 1000, -0.5, 0, 0, 0, 0]), SIZE)
-    slopes = folding.slopes(np.array([[1000.0, 1000], [2000, 1000]]))
+    slopes = folding.compute_slopes(np.array([[1000.0, 1000], [2000, 1000]]))
     assert np.isfinite(slopes[0]).all()
     assert np.isnan(slopes[1]).all()
 
@@ -47,15 +47,15 @@ def test_slopes_are_nan_where_the_lens_folds_over():
 @pytest.mark.parametrize("lens", [BROWN, RATIONAL])
 def test_lens_derivatives_are_those_of_small_steps(lens: Pinhole):
     pixels = lens.project(POINTS)
-    by_point = lens.point_jacobian(POINTS, pixels)
+    by_point = lens.compute_point_jacobian(POINTS, pixels)
     for axis in range(3):
         step = 1e-3 * np.eye(3)[axis]
         numeric = (lens.project(POINTS + step) - lens.project(POINTS - step)) / 2e-3
         assert np.abs(by_point[:, :, axis] - numeric).max() < 1e-6 * np.abs(by_point).max()
-    by_vector = lens.vector_jacobian(POINTS)
+    by_vector = lens.compute_vector_jacobian(POINTS)
     for index in range(len(lens.vector)):
         step = 1e-4 * np.eye(len(lens.vector))[index]
-        numeric = (lens.stepped(step).project(POINTS) - lens.stepped(-step).project(POINTS)) / 2e-4
+        numeric = (lens.apply_step(step).project(POINTS) - lens.apply_step(-step).project(POINTS)) / 2e-4
         assert np.abs(by_vector[:, :, index] - numeric).max() < 1e-4
 
 
@@ -64,11 +64,11 @@ def test_rays_are_straight_invertible_and_differentiated_right():
         5, BROWN.project(POINTS), POINTS, np.full(200, 0.003), BROWN, np.array([[0, 0], [2447, 0], [2447, 2047.0]])
     )
     pixels = rays.project(POINTS)
-    assert np.abs(rays.misfit(POINTS, pixels)).max() < 1e-8
+    assert np.abs(rays.compute_misfit(POINTS, pixels)).max() < 1e-8
     assert np.abs(pixels - BROWN.project(POINTS)).max() < 0.05
     start, slope = rays.lines(pixels)
     assert np.abs(start + POINTS[:, 2:] * slope - POINTS[:, :2]).max() < 1e-8
-    jacobian = rays.point_jacobian(POINTS, pixels)
+    jacobian = rays.compute_point_jacobian(POINTS, pixels)
     for axis in range(3):
         step = 1e-3 * np.eye(3)[axis]
         numeric = (rays.project(POINTS + step) - rays.project(POINTS - step)) / 2e-3
@@ -85,16 +85,16 @@ def test_rays_know_where_they_were_fitted():
 
 def test_directions_across_an_axis_are_at_right_angles():
     axis = np.array([0.6, -0.48, 0.64])
-    frame = np.column_stack([axis, across(axis)])
+    frame = np.column_stack([axis, find_perpendiculars(axis)])
     assert np.abs(frame.T @ frame - np.eye(3)).max() < 1e-12
 
 
 def written_out(problem: TableProblem, scene: TableScene) -> Float:
     """The derivatives of all residuals of the adjustment, nearly all of them zeros."""
-    slopes, count, free = problem.slopes(scene), len(problem.picture), int(problem.freed.sum())
+    slopes, count, free = problem.compute_slopes(scene), len(problem.picture), int(problem.freed.sum())
     lens, first_error = len(scene.lens.vector), slopes.common.shape[2]
     first_point = first_error + free * len(scene.errors)
-    rows = len(problem.residuals(scene))
+    rows = len(problem.compute_residuals(scene))
     matrix = np.zeros((rows, first_point + scene.points_mm.size))
     for index, (position, marker) in enumerate(zip(problem.picture, problem.marker, strict=True)):
         own = slice(2 * index, 2 * index + 2)
@@ -112,9 +112,9 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
     """Every column of the whole problem, at a state with errors in it and without one marker; and the equations are
     those of these derivatives."""
     laboratory = draw(Truth(seed=1))
-    seen = positions(laboratory).part(np.arange(34) % 4 == 0)
+    seen = positions(laboratory).select(np.arange(34) % 4 == 0)
     seen.centres_px[2, 7] = np.nan
-    table = table_from_poses(
+    table = fit_table(
         seen.linear_mm, seen.rotary_deg, laboratory.rotations[::4], laboratory.translations_mm[::4], MIDDLE
     )
     random = np.random.default_rng(1)
@@ -122,12 +122,12 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
     known = board(laboratory)
     scene = TableScene(RATIONAL, table, errors, known.points_mm)
     sigma = TableSigma(0.0005, 0.1, 0.001, 0.2)
-    problem = table_problem(
+    problem = build_table_problem(
         seen, known, sigma, lens=RATIONAL, shifts_px=np.zeros_like(seen.centres_px), used=seen.seen, discrepancy_px=0.0
     )
-    jacobian, residuals = written_out(problem, scene), problem.residuals(scene)
+    jacobian, residuals = written_out(problem, scene), problem.compute_residuals(scene)
     assert len(jacobian) == len(residuals)
-    normal, gradient = problem.equations(scene, residuals)
+    normal, gradient = problem.build_equations(scene, residuals)
     scale = np.sqrt(np.diag(normal))
     assert np.abs((normal - jacobian.T @ jacobian) / scale / scale[:, None]).max() < 1e-12
     assert np.abs(gradient - jacobian.T @ residuals).max() < 1e-12 * np.abs(gradient).max()
@@ -135,7 +135,8 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
         size = 1e-6 / max(1e-6, np.abs(jacobian[:, column]).max()) * 1e3
         step = size * np.eye(jacobian.shape[1])[column]
         numeric = (
-            problem.residuals(problem.stepped(scene, step)) - problem.residuals(problem.stepped(scene, -step))
+            problem.compute_residuals(problem.apply_step(scene, step))
+            - problem.compute_residuals(problem.apply_step(scene, -step))
         ) / (2 * size)
         scale = np.abs(jacobian[:, column]).max()
         assert np.abs(jacobian[:, column] - numeric).max() < 2e-4 * scale, column
@@ -144,8 +145,8 @@ def test_the_adjustments_derivatives_are_those_of_small_steps():
 def test_the_tables_axes_are_found_from_poses():
     laboratory = draw(Truth(seed=0, linear_mm=0.0, rotary_arcmin=0.0))
     linear, rotary = laboratory.recorded.T
-    table = table_from_poses(linear, rotary, laboratory.rotations, laboratory.translations_mm, MIDDLE)
-    rotations, translations = table.poses(linear, rotary, np.zeros((34, 6)))
+    table = fit_table(linear, rotary, laboratory.rotations, laboratory.translations_mm, MIDDLE)
+    rotations, translations = table.compute_poses(linear, rotary, np.zeros((34, 6)))
     assert np.abs(rotations - laboratory.rotations).max() < 1e-9
     assert np.abs(translations - laboratory.translations_mm).max() < 1e-6
 
@@ -159,13 +160,13 @@ def test_eccentricity_is_that_of_the_drawn_outlines():
     true = centres - camera.project(laboratory.board_mm @ rotation.T + translation)
     assert np.abs(true).max() > 0.02
     assert (
-        np.abs(shifts_by_camera(lens.project, rotation, translation, laboratory.board_mm, diameters) - true).max()
+        np.abs(compute_camera_shifts(lens.project, rotation, translation, laboratory.board_mm, diameters) - true).max()
         < 1e-4
     )
-    by_homography = shifts_by_homography(centres, laboratory.board_mm, diameters)
+    by_homography = compute_homography_shifts(centres, laboratory.board_mm, diameters)
     assert np.abs(by_homography - true).max() < 1e-4
     centres[5] = np.nan
-    assert np.isnan(shifts_by_homography(centres, laboratory.board_mm, diameters)[5]).all()
+    assert np.isnan(compute_homography_shifts(centres, laboratory.board_mm, diameters)[5]).all()
 
 
 def test_poses_without_noise_are_exact():
@@ -192,7 +193,7 @@ def test_a_parameter_that_nothing_depends_on_is_refused():
         minimise(
             np.zeros(2),
             lambda x: x[:1] - 1,
-            dense(lambda _: np.array([[1.0, 0.0]])),
+            make_equations(lambda _: np.array([[1.0, 0.0]])),
             lambda state, change: state + change,
         )
 
@@ -202,7 +203,7 @@ def test_the_minimum_of_a_curved_valley_is_found():
     found = minimise(
         np.array([-1.2, 1.0]),
         lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
-        dense(lambda x: np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])),
+        make_equations(lambda x: np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])),
         lambda state, change: state + change,
     )
     assert found.state == pytest.approx([1, 1], abs=1e-3)

@@ -16,7 +16,7 @@ from thermostand.compensation import cli
 from thermostand.compensation.calibration.camera_file import load_camera
 from thermostand.compensation.calibration.pose import find_pose
 from thermostand.compensation.calibration.session_centres import observe_positions
-from thermostand.compensation.observations import session_target
+from thermostand.compensation.observations import read_session_target
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import CalibrationError, SessionError
 from thermostand.foundation.hub import Hub
@@ -25,7 +25,7 @@ from thermostand.foundation.readings import Frame, Quality, Reading
 from thermostand.recording.reading.session import Session
 
 from .conftest import recording
-from .rendered import Scene, photograph, render, true_centres_px
+from .renderer import Scene, compute_true_centres_px, photograph, render
 
 START_NS = 1_767_290_400 * NS_PER_S
 TARGET_YAML = "name: small\ncolumns: 9\nrows: 6\npitch_mm: 30\ndiameter_mm: 10\nprinting_error_mm: 0.002\n"
@@ -97,7 +97,7 @@ def publish_poll(hub: Hub, time_ns: int, axis: str, position: float, moving: flo
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     path = tmp_path_factory.mktemp("sessions") / "calibration"
     asyncio.run(record(path, "calibration"))
-    return Recorded(path, np.array([true_centres_px(scene_at(z + REPORTED_mm, angle)) for z, angle in PLACES]))
+    return Recorded(path, np.array([compute_true_centres_px(scene_at(z + REPORTED_mm, angle)) for z, angle in PLACES]))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def run(*arguments: str | Path) -> Result:
 
 def test_positions_are_what_the_axes_reported_at_rest_and_frames_are_averaged(recorded: Recorded):
     session = Session.open(recorded.path)
-    found = observe_positions(session, session_target(session))
+    found = observe_positions(session, read_session_target(session))
     assert found.linear_mm == pytest.approx([linear + REPORTED_mm for linear, _ in PLACES], abs=1e-9)
     assert found.rotary_deg.tolist() == [rotary for _, rotary in PLACES]  # never reported at rest: where it was sent
     assert found.frames.tolist() == [2] * DARK + [1] + [2] * (len(PLACES) - DARK - 1)
@@ -200,10 +200,10 @@ def test_a_session_without_calibration_frames_is_refused(recorded: Recorded, tmp
     asyncio.run(record(tmp_path / "poses", "pose", PLACES[:1]))
     session = Session.open(tmp_path / "poses")
     with pytest.raises(SessionError, match="the role calibration"):
-        observe_positions(session, session_target(session))
+        observe_positions(session, read_session_target(session))
     text = TARGET_YAML.replace("columns: 9", "columns: 12")
     (tmp_path / "other.yaml").write_text(text)
     session = Session.open(recorded.path)
-    other = session_target(session).model_copy(update={"polarity": "light"})
+    other = read_session_target(session).model_copy(update={"polarity": "light"})
     with pytest.raises(CalibrationError, match="found at 0 positions, 5 are needed; frame"):
         observe_positions(session, other)

@@ -18,15 +18,15 @@ from thermostand.compensation.calibration.uncertainty import NOT_SEEN
 from thermostand.compensation.calibration.views import (
     ViewCalibration,
     calibrate_views,
-    cross_validated_px,
-    known,
-    projection_sigma_um,
+    compute_point_uncertainty,
+    compute_projection_sigma_um,
+    cross_validate_px,
 )
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import CalibrationError
 
 from .calibration_truth import SIZE, Laboratory, TrueCamera, Truth, board, draw
-from .rendered import photograph, render
+from .renderer import photograph, render
 from .test_markers import HALF
 
 TRUE = np.array([7246.0, 7246.0, 1231.8, 1015.4, -0.12, 0.35, 2.0e-4, -3.0e-4, 0.0])
@@ -79,9 +79,9 @@ def test_a_warped_board_that_is_allowed_to_be_warped_does_not_bend_the_lens():
 
 def test_held_out_pictures_are_as_good_as_the_noise_where_the_model_holds_and_worse_where_it_does_not():
     laboratory = draw(Truth(seed=1))
-    assert cross_validated_px(seen(laboratory), board(laboratory)) == pytest.approx(0.003, rel=0.2)
+    assert cross_validate_px(seen(laboratory), board(laboratory)) == pytest.approx(0.003, rel=0.2)
     rippled = draw(Truth(seed=1, camera=replace(Truth().camera, ripple_px=0.05)))
-    assert cross_validated_px(seen(rippled), board(rippled)) > 0.008
+    assert cross_validate_px(seen(rippled), board(rippled)) > 0.008
 
 
 def test_the_uncertainty_is_stated_in_words_larger_at_the_corners_and_for_fewer_pictures():
@@ -89,11 +89,13 @@ def test_the_uncertainty_is_stated_in_words_larger_at_the_corners_and_for_fewer_
     many, few = (calibrate_views(seen(laboratory, every), board(laboratory)) for every in (1, 4))
     pixels = np.array([[1223.5, 1023.5], [0.0, 0.0]])
     for found in (many, few):
-        middle, corner = projection_sigma_um(found, pixels, 826.0)
+        middle, corner = compute_projection_sigma_um(found, pixels, 826.0)
         assert corner > 2 * middle
-    assert np.all(projection_sigma_um(few, pixels, 826.0) > 1.2 * projection_sigma_um(many, pixels, 826.0))
-    told = known(many, 826.0)
-    assert told.middle_um == pytest.approx(2 * projection_sigma_um(many, pixels, 826.0)[0])
+    assert np.all(
+        compute_projection_sigma_um(few, pixels, 826.0) > 1.2 * compute_projection_sigma_um(many, pixels, 826.0)
+    )
+    told = compute_point_uncertainty(many, 826.0)
+    assert told.middle_um == pytest.approx(2 * compute_projection_sigma_um(many, pixels, 826.0)[0])
     assert told.worst_seen_um >= max(um for um in told.corners_um if um is not None)
     seen_all = replace(told, corners_um=(1.0,) * 4, not_seen="")
     assert ("at its worst corner" in seen_all.text, NOT_SEEN in seen_all.text) == (True, False)
@@ -103,7 +105,7 @@ def test_of_corners_that_nobody_saw_nothing_is_said():
     """A wide lens and a target in its middle: the corners are beyond all markers."""
     views, given = wide_angle_views()
     found = calibrate_views(views, given)
-    told = known(found, 400.0)
+    told = compute_point_uncertainty(found, 400.0)
     assert told.corners_um == (None,) * 4
     assert told.middle_um is not None
     assert told.middle_um < told.worst_seen_um < 100 * told.middle_um
@@ -123,9 +125,9 @@ def test_too_few_or_too_equal_pictures_are_refused_with_what_to_do():
     laboratory = draw(Truth(seed=1))
     views = seen(laboratory, 1)
     with pytest.raises(CalibrationError, match="4 pictures show the target, 5 are needed"):
-        calibrate_views(views.part(np.arange(34) < 4), board(laboratory))
+        calibrate_views(views.select(np.arange(34) < 4), board(laboratory))
     with pytest.raises(CalibrationError, match=r"20 to 40 deg"):
-        calibrate_views(views.part(np.arange(34) % 5 == 2), board(laboratory))
+        calibrate_views(views.select(np.arange(34) % 5 == 2), board(laboratory))
 
 
 def test_the_command_calibrates_photographs_and_says_how_well(tmp_path: Path):

@@ -10,20 +10,20 @@ import pytest
 from typer.testing import CliRunner
 
 from thermostand.compensation import cli
-from thermostand.compensation.arrays import observations_of_table
+from thermostand.compensation.array_observations import load_observations
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift_runtime import Drift
 from thermostand.foundation.errors import SessionError
 
-from .drawn_cameras import drawn_camera
-from .drawn_nights import full_night, night
+from .drawn_cameras import draw_camera
+from .drawn_sessions import make_full_session, record_session
 
 HEAD = "frame,marker,x_px,y_px,camera_degC"
 
 
 def written(path: Path, *, air: bool) -> Path:
     """A drawn night as a table."""
-    seen = night(drawn_camera(1), full_night()).observed
+    seen = record_session(draw_camera(1), make_full_session()).observed
     names = [*HEAD.split(","), "chamber_degC", "role", "time_ns", *(["air_degC"] if air else [])]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -52,7 +52,7 @@ def test_a_table_is_fitted_without_session_and_stand(tmp_path: Path) -> None:
 
 def test_a_table_gives_what_it_says(tmp_path: Path) -> None:
     path = written(tmp_path / "centres.csv", air=True)
-    seen, found = night(drawn_camera(1), full_night()).observed, observations_of_table(path, "C-1")
+    seen, found = record_session(draw_camera(1), make_full_session()).observed, load_observations(path, "C-1")
     assert found.sessions[0].camera_serial == "C-1"
     assert np.allclose(found.centres_px[:, ::5], seen.centres_px[:, ::5])
     assert np.isnan(found.centres_px[:, 1]).all()
@@ -89,6 +89,6 @@ def test_what_is_no_table_of_centres_is_refused_with_file_line_and_column(text: 
     path = tmp_path / "centres.csv"
     path.write_text(text)
     with pytest.raises(SessionError, match=r"centres\.csv: ") as raised:
-        observations_of_table(path)
+        load_observations(path)
     assert says in str(raised.value)
     assert "\n" not in str(raised.value)

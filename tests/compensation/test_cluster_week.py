@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.finding.piece import FoundMarkers, find_markers, joined, pieces_of
-from thermostand.compensation.observations import session_target
+from thermostand.compensation.finding.piece import FoundMarkers, concatenate_markers, find_markers, split_into_pieces
+from thermostand.compensation.observations import read_session_target
 from thermostand.recording.reading.session import Session
 
-from .cluster_week import CAMERAS, week
+from .cluster_week import CAMERAS, run_week
 from .conftest import Recorded
 
 PER_PIECE = 5
@@ -25,9 +25,11 @@ def test_ten_cameras_give_the_same_bits_in_flat_memory_and_a_killed_worker_costs
 ):
     pytest.importorskip("distributed")
     session = Session.open(recorded.path)
-    expected = joined([find_markers(piece) for piece in pieces_of(session, session_target(session), None, PER_PIECE)])
+    expected = concatenate_markers(
+        [find_markers(piece) for piece in split_into_pieces(session, read_session_target(session), None, PER_PIECE)]
+    )
     cameras = [shutil.copytree(recorded.path, tmp_path / f"camera-{number}") for number in range(CAMERAS)]
-    made = week(map(Session.open, cameras), PER_PIECE)
+    made = run_week(map(Session.open, cameras), PER_PIECE)
     assert len(made.found) == CAMERAS
     for found in made.found:
         for field in fields(FoundMarkers):

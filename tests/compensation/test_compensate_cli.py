@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from thermostand.compensation import cli
-from thermostand.compensation.drift.evaluation import table
+from thermostand.compensation.drift.evaluation import format_table
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.reporting.report import analyse
@@ -97,7 +97,7 @@ def test_fit_then_report_then_analyse_agree(recorded: Recorded, tmp_path: Path, 
     assert reported.exit_code == 0
     evaluation = analyse([recorded.path], tmp_path / "model2.json", tmp_path / "report2.html", progress)
     assert evaluation is not None
-    assert table(evaluation) == reported.stdout.rstrip("\n")
+    assert format_table(evaluation) == reported.stdout.rstrip("\n")
     assert (tmp_path / "model2.json").read_bytes() == (tmp_path / "model.json").read_bytes()
     for suffix in ("html", "json"):
         assert (tmp_path / f"report2.{suffix}").read_bytes() == (tmp_path / f"report.{suffix}").read_bytes()

@@ -10,28 +10,28 @@ from numba.core.event import RecordingListener, install_listener
 
 from tests.compensation.conftest import GLARE, TARGET_YAML, photo
 from thermostand.foundation.documents import parse_document
-from thermostand.markers import compiled
+from thermostand.markers import jit
 from thermostand.markers.compile_ahead import compile_ahead
-from thermostand.markers.compiled import digest
 from thermostand.markers.detection import Flag, detect
+from thermostand.markers.jit import compute_digest
 from thermostand.markers.target import Target
 from thermostand.recording.format.images import encode_png
 
 PROGRAM = """
-from thermostand.markers.compiled import entry
+from thermostand.markers.jit import compile_entry
 from thing import twice
 print(twice(21), len(twice.stats.cache_hits))
 """
 THING = """
-from thermostand.markers.compiled import entry
-@entry
+from thermostand.markers.jit import compile_entry
+@compile_entry
 def twice(x):
     return 2 * x
 """
 
 
 def run(folder: Path, **environment: str) -> str:
-    paths = os.pathsep.join([str(folder), str(Path(compiled.__file__).parents[1])])
+    paths = os.pathsep.join([str(folder), str(Path(jit.__file__).parents[1])])
     settings = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1", **environment}
     done = subprocess.run([sys.executable, "-c", PROGRAM], env=settings, capture_output=True, text=True, check=True)
     return done.stdout
@@ -50,8 +50,8 @@ def test_an_installation_where_nothing_can_be_written_compiles_in_every_process(
 
 
 def test_a_digest_follows_the_sources():
-    assert digest(compiled) == digest(compiled)
-    assert digest(compiled) != digest(compiled, pytest)
+    assert compute_digest(jit) == compute_digest(jit)
+    assert compute_digest(jit) != compute_digest(jit, pytest)
 
 
 def test_nothing_is_compiled_once_that_was_done_ahead():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import ConfigError, DetectionError
 from thermostand.markers.corner_board import AprilGrid, BoardOfCorners, CornerBoard, find_corners, load_corner_board
@@ -136,7 +136,7 @@ def test_files_that_say_their_kind_are_boards_of_squares_and_others_are_not(tmp_
     assert load_corner_board(path) is None
 
 
-@pytest.mark.parametrize("kind", ["aprilgrid", by_night("charuco"), by_night("checkerboard")])
+@pytest.mark.parametrize("kind", ["aprilgrid", mark_nightly("charuco"), mark_nightly("checkerboard")])
 def test_the_command_calibrates_from_corners(kind: str, tmp_path: Path):
     board = BOARDS[kind]
     described = tmp_path / "board.yaml"

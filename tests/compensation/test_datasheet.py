@@ -14,29 +14,34 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app
 from thermostand.compensation.datasheet.datasheet import (
-    NIGHTS,
+    BETWEEN_SESSIONS,
     Contribution,
     Datasheet,
     MeasuredQuantity,
     Visits,
     Warming,
-    datasheet,
-    frame_noise,
-    motions,
-    pooled,
-    warming_quantities,
+    compute_datasheet,
+    compute_warm_up_quantities,
+    estimate_frame_noise,
+    fit_motions,
+    pool_sessions,
 )
-from thermostand.compensation.datasheet.details import Details, load_details
-from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.datasheet.measurement_details import MeasurementDetails, load_details
+from thermostand.compensation.drift.model_selection import fit
 from thermostand.compensation.drift.paper_model import fit_paper
 from thermostand.compensation.observations import Observations
-from thermostand.compensation.reporting.numbers import compact, measured, percent, significant
-from thermostand.compensation.reporting.pages import datasheet_json, datasheet_page
+from thermostand.compensation.reporting.pages import render_datasheet_page, serialise_datasheet
+from thermostand.compensation.reporting.report_numbers import (
+    format_compact,
+    format_percent,
+    format_significant,
+    format_with_expanded_uncertainty,
+)
 from thermostand.foundation.errors import ConfigError
 
 from .conftest import Recorded
-from .drawn_cameras import Camera, Float, centres_px, drawn_camera, settled_degC
-from .drawn_nights import NOISE_PX, full_night, night
+from .drawn_cameras import Camera, Float, centres_px, compute_settled_degC, draw_camera
+from .drawn_sessions import NOISE_PX, make_full_session, record_session
 from .synthetic import observations
 
 COEFFICIENTS = ("shift_I_per_K", "shift_J_per_K", "scale_per_K", "turn_per_K")
@@ -45,23 +50,25 @@ COEFFICIENTS = ("shift_I_per_K", "shift_J_per_K", "scale_per_K", "turn_per_K")
 @cache
 def recorded_night(camera_seed: int, effects: tuple[str, ...], seed: int) -> Observations:
     """The same for all tests, who read it only."""
-    return night(drawn_camera(camera_seed, *effects), full_night(), seed).observed
+    return record_session(draw_camera(camera_seed, *effects), make_full_session(), seed).observed
 
 
-def sheet_of(observed: Observations, details: Details | None = None) -> Datasheet:
+def sheet_of(observed: Observations, details: MeasurementDetails | None = None) -> Datasheet:
     """With the paper's form alone, which is quick: it decides on no coefficient."""
-    return datasheet(observed, fit_paper(observed), details)
+    return compute_datasheet(observed, fit_paper(observed), details)
 
 
 @pytest.fixture(scope="module")
 def sheet() -> Datasheet:
     observed = recorded_night(2003, ("sag",), 1)
-    return datasheet(observed, fit(observed))
+    return compute_datasheet(observed, fit(observed))
 
 
 def at_rest_per_K(camera: Camera) -> Float:
     """The true motions of a camera at rest, around its reference: least squares of the physics, not of the program."""
-    cold, warm = (centres_px(camera, settled_degC(camera, degC)[None], np.zeros((1, 2)))[0] for degC in (23.0, 25.0))
+    cold, warm = (
+        centres_px(camera, compute_settled_degC(camera, degC)[None], np.zeros((1, 2)))[0] for degC in (23.0, 25.0)
+    )
     x, y = ((cold + warm) / 2 - (1223.5, 1023.5)).T
     one, zero = np.ones(54), np.zeros(54)
     terms = np.concatenate([np.stack([one, zero, x, -y], axis=1), np.stack([zero, one, y, x], axis=1)])
@@ -72,7 +79,7 @@ def test_the_coefficients_of_drawn_cameras_hold_the_truth_within_their_expanded_
     inside, small = [], []
     for seed in range(5):
         known = sheet_of(recorded_night(2001 + seed, (), seed)).by_key
-        for key, truth in zip(COEFFICIENTS, at_rest_per_K(drawn_camera(2001 + seed)), strict=True):
+        for key, truth in zip(COEFFICIENTS, at_rest_per_K(draw_camera(2001 + seed)), strict=True):
             inside.append(abs(known[key].value - truth) <= known[key].expanded)
         small.append(known["scale_per_K"].expanded / abs(known["scale_per_K"].value))
     assert np.mean(inside) >= 0.85
@@ -82,10 +89,10 @@ def test_the_coefficients_of_drawn_cameras_hold_the_truth_within_their_expanded_
 @pytest.mark.usefixtures("undrawn")
 def test_two_nights_of_a_camera_agree(sheet: Datasheet):
     observed = recorded_night(2003, ("sag",), 2)
-    other = datasheet(observed, fit(observed)).by_key
+    other = compute_datasheet(observed, fit(observed)).by_key
     for one in sheet.quantities:
         assert abs(one.value - other[one.key].value) <= math.hypot(one.expanded, other[one.key].expanded), one.key
-    assert "not measured" not in datasheet_page(sheet)
+    assert "not measured" not in render_datasheet_page(sheet)
     worse = sheet_of(recorded_night(2003, ("sag",), 1)).by_key
     assert math.isnan(worse["left_thermal_I"].value)
 
@@ -99,7 +106,7 @@ def test_a_known_motion_is_found():
         )
 
     seen = observations(drift)
-    found = motions(seen)
+    found = fit_motions(seen)
     above = seen.chamber_degC - 24.0
     np.testing.assert_allclose(found, above[:, None] * [0.01, -0.02, 30.0, 5.0], atol=1e-6)
 
@@ -116,7 +123,7 @@ def test_a_budget_adds_up_and_its_expanded_uncertainty_is_twice_the_root(sheet: 
 
 def test_the_air_s_uncertainty_counts_in_what_depends_on_it():
     observed = recorded_night(2003, ("sag",), 1)
-    known, worse = (sheet_of(observed, Details(u_air_K=u_K)).by_key for u_K in (0.1, 0.5))
+    known, worse = (sheet_of(observed, MeasurementDetails(u_air_K=u_K)).by_key for u_K in (0.1, 0.5))
     for key in (*COEFFICIENTS, "self_heating_K"):
         assert worse[key].u > known[key].u
     assert worse["hysteresis_I"].u == known["hysteresis_I"].u
@@ -125,13 +132,13 @@ def test_the_air_s_uncertainty_counts_in_what_depends_on_it():
 def test_several_nights_are_pooled_and_their_difference_is_a_contribution():
     lines = Contribution("noise", "A", 0.3, "px", ""), Contribution("air", "B", 0.1, "K", "", 2.0)
     one = MeasuredQuantity("k", "g", "n", "px", "m").found(1.0, *lines)
-    both = pooled([one, replace(one, value=1.2)])
+    both = pool_sessions([one, replace(one, value=1.2)])
     assert both.value == pytest.approx(1.1)
     a, b, nights = both.contributions
     assert a.amount == pytest.approx(0.3 / math.sqrt(2))
     assert b.amount == pytest.approx(0.2)
-    assert (nights.source, nights.amount) == (NIGHTS, pytest.approx(0.1))
-    assert pooled([replace(one, value=math.nan), one]) == one
+    assert (nights.source, nights.amount) == (BETWEEN_SESSIONS, pytest.approx(0.1))
+    assert pool_sessions([replace(one, value=math.nan), one]) == one
 
 
 def after(first: Observations, second: Observations) -> Observations:
@@ -156,29 +163,31 @@ def after(first: Observations, second: Observations) -> Observations:
 
 @pytest.mark.usefixtures("undrawn")
 def test_of_two_sessions_each_counts_and_their_difference_is_stated():
-    camera = drawn_camera(2003, "unrepeated")
-    one, other = (night(camera, full_night(), seed, session_id=f"night-{seed}").observed for seed in (1, 2))
+    camera = draw_camera(2003, "unrepeated")
+    one, other = (
+        record_session(camera, make_full_session(), seed, session_id=f"night-{seed}").observed for seed in (1, 2)
+    )
     both = after(one, other)
-    sheet = datasheet(both, fit_paper(both))
+    sheet = compute_datasheet(both, fit_paper(both))
     assert len(sheet.nights) == 2
     for pooled_one, first, second in zip(sheet.quantities, *sheet.nights, strict=False):
         assert pooled_one.value == pytest.approx((first.value + second.value) / 2)
-        assert NIGHTS in {line.source for line in pooled_one.contributions}
-    page = datasheet_page(sheet)
+        assert BETWEEN_SESSIONS in {line.source for line in pooled_one.contributions}
+    page = render_datasheet_page(sheet)
     assert "From 2 sessions" in page
     assert "One night was recorded" not in page
-    assert len(json.loads(datasheet_json(sheet))["nights"]) == 2
+    assert len(json.loads(serialise_datasheet(sheet))["nights"]) == 2
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_without_a_warm_up_the_sheet_says_that_it_was_not_measured():
-    made = night(drawn_camera(2001), full_night(with_warm_up=False))
-    one = datasheet(made.observed, fit_paper(made.observed))
+    made = record_session(draw_camera(2001), make_full_session(with_warm_up=False))
+    one = compute_datasheet(made.observed, fit_paper(made.observed))
     assert math.isnan(one.by_key["settling_s"].value)
-    page = datasheet_page(one)
+    page = render_datasheet_page(one)
     assert "not measured" in page
     assert "no warm-up was recorded" in page
-    rows = {row["key"]: row for row in json.loads(datasheet_json(one))["quantities"]}
+    rows = {row["key"]: row for row in json.loads(serialise_datasheet(one))["quantities"]}
     assert rows["settling_s"]["value"] is None
     assert rows["scale_per_K"]["expanded_uncertainty"] > 0
 
@@ -186,11 +195,11 @@ def test_without_a_warm_up_the_sheet_says_that_it_was_not_measured():
 def test_the_page_states_what_was_stated_and_what_was_not(sheet: Datasheet, tmp_path: Path):
     stated = tmp_path / "details.yaml"
     stated.write_text("lens: 25 mm f/1.4\nu_air_K: 0.05\nsensor_positions: {air: beside the camera}\n")
-    page = datasheet_page(replace(sheet, details=load_details(stated)), [("Exposure", "100 ms")])
+    page = render_datasheet_page(replace(sheet, details=load_details(stated)), [("Exposure", "100 ms")])
     for text in ("25 mm f/1.4", "air: beside the camera", "100 ms", "not stated", "0.05 K (as stated)", "Figure 2."):
         assert text in page
-    assert "assumed, since" in datasheet_page(sheet)
-    assert page == datasheet_page(replace(sheet, details=load_details(stated)), [("Exposure", "100 ms")])
+    assert "assumed, since" in render_datasheet_page(sheet)
+    assert page == render_datasheet_page(replace(sheet, details=load_details(stated)), [("Exposure", "100 ms")])
     stated.write_text("lense: 25 mm\n")
     with pytest.raises(ConfigError, match="lense"):
         load_details(stated)
@@ -198,7 +207,7 @@ def test_the_page_states_what_was_stated_and_what_was_not(sheet: Datasheet, tmp_
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_says_where_it_holds_what_measured_it_and_how_the_uncertainty_is_made(sheet: Datasheet):
-    page = datasheet_page(sheet)
+    page = render_datasheet_page(sheet)
     low, high = sheet.air_degC
     for text in ("Valid for", f"{low:.1f} to {high:.1f} °C", "Not covered", "Measured with", "Software", "numpy"):
         assert text in page
@@ -219,7 +228,7 @@ def test_the_page_says_where_it_holds_what_measured_it_and_how_the_uncertainty_i
     ],
 )
 def test_a_value_has_the_decimals_of_its_uncertainty(value: float, expanded: float, texts: tuple[str, str]):
-    assert measured(value, expanded) == texts
+    assert format_with_expanded_uncertainty(value, expanded) == texts
 
 
 @pytest.mark.parametrize(
@@ -227,14 +236,14 @@ def test_a_value_has_the_decimals_of_its_uncertainty(value: float, expanded: flo
     [(-0.06105, 0.00809, "−0.0611(81)"), (0.5, 0.02, "0.500(20)"), (12.3, 1.44, "12.3(1.4)"), (1.0, 0.0, "1")],
 )
 def test_a_coefficient_has_its_uncertainty_in_brackets(value: float, u: float, text: str):
-    assert compact(value, u) == text
+    assert format_compact(value, u) == text
 
 
 @pytest.mark.parametrize(
     ("value", "text"), [(99.97, ">\xa099.9\xa0%"), (100, "100.0 %"), (0.01, "<\xa00.1\xa0%"), (0, "0.0 %")]
 )
 def test_a_share_is_never_rounded_to_all_or_none(value: float, text: str):
-    assert percent(value) == text
+    assert format_percent(value) == text
 
 
 def test_the_command_writes_what_the_name_says(recorded: Recorded, tmp_path: Path):
@@ -267,7 +276,7 @@ def test_the_noise_of_the_markers_is_small_beside_the_rest(sheet: Datasheet):
     ],
 )
 def test_a_number_of_a_budget_has_its_digits_and_no_exponent(value: float, digits: int, text: str):
-    assert significant(value, digits) == text
+    assert format_significant(value, digits) == text
 
 
 @pytest.mark.parametrize("spacing_s", [5.0, 30.0, 120.0, 240.0])
@@ -276,7 +285,7 @@ def test_the_noise_of_a_warm_up_is_that_of_its_frames_and_not_its_curvature(spac
     rng, at_s = np.random.default_rng(5), np.arange(0.0, 7200.0, spacing_s)
     for constants_s in ((370.0,), (370.0, 1900.0), (90.0, 1200.0)):
         drift = sum(0.3 * -np.expm1(-at_s / constant_s) for constant_s in constants_s)
-        found = [frame_noise(at_s, drift + noise_px * rng.standard_normal(len(at_s))) for _ in range(40)]
+        found = [estimate_frame_noise(at_s, drift + noise_px * rng.standard_normal(len(at_s))) for _ in range(40)]
         assert math.sqrt(np.mean(np.square(found))) == pytest.approx(noise_px, rel=0.1, abs=5e-4)
 
 
@@ -286,6 +295,6 @@ def test_the_uncertainty_of_a_warm_up_s_drift_is_no_part_of_the_drift():
     warming = Warming(at_s, True, np.full(len(at_s), 24.0), 24 + 8 * -np.expm1(-at_s / 370.0), moved - moved[0])
     nothing = np.empty(0)
     visits = Visits(nothing, nothing, nothing, np.empty((0, 4)))
-    known = {each.key: each for each in warming_quantities(warming, visits, (0.001, 0.001, 1.0, 1.0), 0.1)}
+    known = {each.key: each for each in compute_warm_up_quantities(warming, visits, (0.001, 0.001, 1.0, 1.0), 0.1)}
     noise = {key: known[key].contributions[1].amount for key in ("warm_up_shift_I", "warm_up_shift_J")}
     assert max(noise.values()) < 0.0005

@@ -2,20 +2,20 @@
 
 import multiprocessing
 
-from thermostand.compensation.reporting.drawing.figures import drawing, new_figure, one_by_one
+from thermostand.compensation.reporting.drawing.figures import create_figure, open_renderer, render_in_turn
 
 
 def test_two_processes_draw_the_same_bytes():
     figures = []
     for number in range(5):
-        figure, (panel,) = new_figure(3, 2, 1, 1)
+        figure, (panel,) = create_figure(3, 2, 1, 1)
         panel.plot([0, 1, number])
         figures.append((figure, f"figure-{number}"))
-    expected = one_by_one(figures)
-    with drawing(2) as draw:
+    expected = render_in_turn(figures)
+    with open_renderer(2) as draw:
         assert draw(figures) == expected
         for child in multiprocessing.active_children():
             child.kill()
         assert draw(figures) == expected
-    with drawing(1) as draw:
-        assert draw is one_by_one
+    with open_renderer(1) as draw:
+        assert draw is render_in_turn

@@ -5,15 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from .drawn_cameras import ALL_EFFECTS, Camera, Float, centres_px, drawn_camera, nodes_degC, settled_degC, target_mm
-from .drawn_nights import cycle, full_night, night, reference, unseen_begin, warm_up
+from .drawn_cameras import (
+    ALL_EFFECTS,
+    Camera,
+    Float,
+    centres_px,
+    compute_settled_degC,
+    draw_camera,
+    nodes_degC,
+    target_mm,
+)
+from .drawn_sessions import cycle, make_full_session, make_unseen_begin, record_session, reference, warm_up
 
 STILL = np.zeros((1, 2))
 SEEDS = range(12)
 
 
 def settled_px(camera: Camera, air_degC: float) -> Float:
-    return centres_px(camera, settled_degC(camera, air_degC)[None], STILL)[0]
+    return centres_px(camera, compute_settled_degC(camera, air_degC)[None], STILL)[0]
 
 
 def width_px(centres: Float) -> float:
@@ -22,7 +31,7 @@ def width_px(centres: Float) -> float:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_scale_and_principal_point_are_in_the_published_ranges(seed: int) -> None:
-    camera = drawn_camera(seed)
+    camera = draw_camera(seed)
     warm, cold = settled_px(camera, 25.0), settled_px(camera, 23.0)
     ppm_per_K = 1e6 * (width_px(warm) / width_px(cold) - 1) / 2
     assert -40 < ppm_per_K < 55
@@ -33,21 +42,21 @@ def test_scale_and_principal_point_are_in_the_published_ranges(seed: int) -> Non
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_camera_settles_within_the_published_times(seed: int) -> None:
-    camera = drawn_camera(seed)
+    camera = draw_camera(seed)
     step = np.full(12 * 360, 34.0)
     step[0] = 24.0
     nodes = nodes_degC(camera, step, np.ones(len(step)))
-    left = np.abs(nodes - settled_degC(camera, 34.0)).max(axis=1) / np.abs(nodes[0] - nodes[-1]).max()
+    left = np.abs(nodes - compute_settled_degC(camera, 34.0)).max(axis=1) / np.abs(nodes[0] - nodes[-1]).max()
     minutes = 10 / 60 * float(np.flatnonzero(left > np.exp(-1))[-1])
     assert 4 < minutes < 100
 
 
 def test_each_effect_changes_what_is_recorded_and_nothing_else_does() -> None:
-    plain = night(drawn_camera(3), full_night())
-    again = night(drawn_camera(3), full_night())
+    plain = record_session(draw_camera(3), make_full_session())
+    again = record_session(draw_camera(3), make_full_session())
     assert np.array_equal(plain.truth_px, again.truth_px)
     for name in ALL_EFFECTS:
-        other = night(drawn_camera(3, name), full_night())
+        other = record_session(draw_camera(3, name), make_full_session())
         moved = np.abs(other.truth_px - plain.truth_px).max()
         if name in ("coarse_sensor", "far_air"):
             assert moved == 0
@@ -58,7 +67,7 @@ def test_each_effect_changes_what_is_recorded_and_nothing_else_does() -> None:
 
 
 def test_a_switched_off_camera_tells_no_temperature_and_is_as_cold_as_the_air() -> None:
-    made = night(drawn_camera(1), [*warm_up(), *reference()])
+    made = record_session(draw_camera(1), [*warm_up(), *reference()])
     history = made.observed.histories[0]
     assert len(history.camera_ns) < len(history.ambient_ns) / 2
     assert abs(made.observed.camera_degC[0] - made.observed.air_degC[0]) < 6
@@ -66,9 +75,9 @@ def test_a_switched_off_camera_tells_no_temperature_and_is_as_cold_as_the_air() 
 
 
 def test_what_was_before_the_record_moves_the_image_and_is_not_in_the_history() -> None:
-    camera = drawn_camera(1)
+    camera = draw_camera(1)
     parts = [*reference(), *cycle()]
-    unseen, known = night(camera, parts, unrecorded=unseen_begin()), night(camera, parts)
+    unseen, known = record_session(camera, parts, unrecorded=make_unseen_begin()), record_session(camera, parts)
     assert 0.02 < np.abs(unseen.truth_px[0] - known.truth_px[0]).max() < 2.0
     history = unseen.observed.histories[0]
     before_s = (unseen.observed.time_ns[0] - history.ambient_ns[0]) / 1e9
@@ -77,8 +86,8 @@ def test_what_was_before_the_record_moves_the_image_and_is_not_in_the_history() 
 
 
 def test_a_target_further_away_is_seen_smaller_and_a_turned_one_narrower() -> None:
-    camera = drawn_camera(3)
-    nodes = settled_degC(camera, 24.0)[None]
+    camera = draw_camera(3)
+    nodes = compute_settled_degC(camera, 24.0)[None]
     usual, far, turned = (
         centres_px(camera, nodes, STILL, target_mm(*place))[0] for place in ((0.0, 0.0), (82.6, 0.0), (0.0, 60.0))
     )

@@ -10,26 +10,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.displacements import displacements
-from thermostand.compensation.drift.facts import ModelFacts
-from thermostand.compensation.drift.hull import convex_hull
-from thermostand.compensation.drift.hysteresis import hysteresis
+from thermostand.compensation.drift.displacements import compute_displacements
+from thermostand.compensation.drift.hull import compute_convex_hull
+from thermostand.compensation.drift.hysteresis import compute_hysteresis
+from thermostand.compensation.drift.model_facts import ModelFacts
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift.paper_model import (
     DegreeScore,
     PaperModel,
-    choose,
+    build_design_matrix,
+    choose_degree,
     condense,
-    design,
     fit_paper,
     solve,
 )
-from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_fit import fit_thermal
 from thermostand.compensation.history.thermal_history import States
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.files import write_whole
+from thermostand.foundation.files import write_atomically
 
 from .reservoirs import cycle, reference, session, warm_up
 from .synthetic import CAMERA_ABOVE_CHAMBER_K, FIT_DEGC, facts, observations, places_px, polynomial_drift, quadratic
@@ -65,7 +65,7 @@ def test_a_drift_of_degree_n_is_recovered_everywhere_by_the_fit_of_degree_n(degr
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_the_fit_is_that_of_plain_monomials_in_pixels_and_degrees(noisy: Observations, degree: int):
-    rows = displacements(noisy, noisy.of(Role.REFERENCE, Role.FIT))
+    rows = compute_displacements(noisy, noisy.of(Role.REFERENCE, Role.FIT))
     (i, j), t = rows.measured_px.T, rows.camera_degC
     powers = [(a, b, c) for a in range(6) for b in range(6) for c in range(6) if a + b + c <= degree]
     raw = np.stack([i**a * j**b * t**c for a, b, c in powers], axis=1)
@@ -75,7 +75,7 @@ def test_the_fit_is_that_of_plain_monomials_in_pixels_and_degrees(noisy: Observa
 
 
 def test_what_is_left_at_held_out_temperatures_is_the_noise(noisy: Observations, model: PaperModel):
-    rows = displacements(noisy, noisy.of(Role.VALIDATION))
+    rows = compute_displacements(noisy, noisy.of(Role.VALIDATION))
     after = rows.displacement_px - model.shift(rows.measured_px, rows.camera_degC)
     assert rms(rows.displacement_px) > 0.3
     assert rms(after) == pytest.approx(NOISE_PX * np.sqrt(1 + 1 / 8), rel=0.05)
@@ -98,9 +98,9 @@ def score(degree: int, *fold_rms_px: float) -> DegreeScore:
 
 def test_one_standard_error_of_the_difference_decides():
     best = score(3, 0.10, 0.20, 0.10, 0.30)
-    assert choose((score(1, 0.20, 0.30, 0.20, 0.40), score(2, 0.09, 0.23, 0.10, 0.30), best)) == 2
-    assert choose((score(1, 0.20, 0.30, 0.20, 0.40), score(2, 0.11, 0.21, 0.11, 0.31), best)) == 3
-    assert choose((best, score(4, 0.10, 0.20, 0.10, 0.31))) == 3
+    assert choose_degree((score(1, 0.20, 0.30, 0.20, 0.40), score(2, 0.09, 0.23, 0.10, 0.30), best)) == 2
+    assert choose_degree((score(1, 0.20, 0.30, 0.20, 0.40), score(2, 0.11, 0.21, 0.11, 0.31), best)) == 3
+    assert choose_degree((best, score(4, 0.10, 0.20, 0.10, 0.31))) == 3
 
 
 def test_only_reference_and_fit_frames_are_fitted(noisy: Observations, model: PaperModel, tmp_path: Path):
@@ -128,7 +128,7 @@ def test_an_uncertain_centre_counts_for_little_and_a_missing_one_for_nothing(noi
 def test_the_covariance_of_the_coefficients_is_that_of_repeated_fits(model: PaperModel):
     rng = np.random.default_rng(3)
     xy, camera_degC = rng.uniform([0, 0], [2447, 2047], (60, 2)), rng.uniform(25, 67, 60)
-    terms = design(xy, camera_degC, 2, model.scaling)
+    terms = build_design_matrix(xy, camera_degC, 2, model.scaling)
     sigma = rng.uniform(0.002, 0.01, 60)
     fits = [solve([condense(terms, sigma * rng.standard_normal(60), sigma**2)], 60) for _ in range(400)]
     white = np.linalg.cholesky(terms.T @ (terms / sigma[:, None] ** 2))
@@ -152,7 +152,7 @@ def test_the_hull_has_the_corners_only():
     rng = np.random.default_rng(2)
     square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
     points = np.concatenate([rng.uniform(0.1, 3.9, (50, 2)), square, [[2.0, 0.0], [4.0, 1.0]], square])
-    assert sorted(convex_hull(points).tolist()) == sorted(square.tolist())
+    assert sorted(compute_convex_hull(points).tolist()) == sorted(square.tolist())
 
 
 def test_nan_in_is_nan_out(model: PaperModel):
@@ -243,7 +243,7 @@ def test_a_model_that_cannot_be_written_leaves_nothing(model: PaperModel, tmp_pa
 def test_a_file_that_cannot_be_finished_leaves_the_older_one(tmp_path: Path):
     (tmp_path / "model.json").write_text("older")
     with pytest.raises(UnicodeEncodeError):
-        write_whole(tmp_path / "model.json", "begun, then \ud800")
+        write_atomically(tmp_path / "model.json", "begun, then \ud800")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("model.json", "older")]
 
 
@@ -331,7 +331,7 @@ def visited(opening_px: float, cycles: int = 1, creep_px: float = 0.0, noise_px:
 
 
 def test_the_gap_between_the_branches_is_found_with_its_uncertainty():
-    (found,) = hysteresis(visited(0.05, noise_px=0.004))
+    (found,) = compute_hysteresis(visited(0.05, noise_px=0.004))
     assert [gap.chamber_degC for gap in found.gaps] == [24.0, 31.0]
     for gap in found.gaps:
         np.testing.assert_allclose(gap.uncertainty_px, 0.004 * np.sqrt((1 + 1 / 8) / 54), rtol=0.01)
@@ -344,14 +344,14 @@ def test_the_gap_between_the_branches_is_found_with_its_uncertainty():
 
 
 def test_no_opening_is_no_hysteresis():
-    (found,) = hysteresis(visited(0.0))
+    (found,) = compute_hysteresis(visited(0.0))
     np.testing.assert_allclose(found.largest_px, 0, atol=1e-9)
     np.testing.assert_allclose(found.closure_px, 0, atol=1e-9)
     assert np.isnan(found.repeatability_px).all()
 
 
 def test_what_does_not_come_back_is_closure_and_repeatability():
-    (found,) = hysteresis(visited(0.0, cycles=2, creep_px=0.02))
+    (found,) = compute_hysteresis(visited(0.0, cycles=2, creep_px=0.02))
     np.testing.assert_allclose(found.closure_px, [0.02, 0], atol=1e-9)
     assert 0.5 * 0.02 / np.sqrt(2) < found.repeatability_px[0] <= 0.02 / np.sqrt(2) + 1e-9
     assert found.repeatability_px[1] == pytest.approx(0, abs=1e-9)
@@ -359,16 +359,16 @@ def test_what_does_not_come_back_is_closure_and_repeatability():
 
 def test_a_camera_with_play_opens_and_the_thermal_form_closes_it():
     loose, _ = session(warm_up(24.0) + reference() + cycle(), plays=True)
-    (before,) = hysteresis(loose)
-    (paper,) = hysteresis(loose, fit_paper(loose, 2))
-    (after,) = hysteresis(loose, fit_thermal(loose))
+    (before,) = compute_hysteresis(loose)
+    (paper,) = compute_hysteresis(loose, fit_paper(loose, 2))
+    (after,) = compute_hysteresis(loose, fit_thermal(loose))
     assert before.rms_px[1] > 0.1
     assert paper.rms_px[1] > 0.5 * before.rms_px[1]
     assert after.rms_px[1] < 0.2 * before.rms_px[1]
 
 
 def test_one_way_only_has_no_gaps():
-    (found,) = hysteresis(observations(quadratic, fit_degC=FIT_DEGC[3:], held_out_degC=()))
+    (found,) = compute_hysteresis(observations(quadratic, fit_degC=FIT_DEGC[3:], held_out_degC=()))
     assert found.gaps == ()
     assert np.isnan(found.largest_px).all()
     assert np.isnan(found.rms_px).all()

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.markers import edge_fit
 from thermostand.markers.edge_fit import EdgeFit, Flag, fit_edges
 from thermostand.markers.edge_model import (
@@ -29,8 +29,8 @@ from thermostand.markers.edge_model import (
     EdgeState,
     Float,
     Work,
-    normal_distribution,
-    normal_equations,
+    build_normal_equations,
+    evaluate_normal_distribution,
 )
 from thermostand.markers.noise import Noise
 from thermostand.markers.pixels import (
@@ -43,17 +43,17 @@ from thermostand.markers.pixels import (
     Pixels,
     U,
     V,
-    empty_pixels,
+    allocate_pixels,
     gather,
-    picture_of,
+    make_picture,
 )
 
-from .rendered import Scene, photograph, project, render, shaded_light, true_centres_px
+from .renderer import Scene, compute_true_centres_px, make_shaded_light, photograph, project, render
 
 SCENES = {
     "A even light": (Scene(), 2.21),
     "B sharp": (Scene(psf_px=0.8), 1.97),
-    "D shaded": (Scene(light=shaded_light), 2.21),
+    "D shaded": (Scene(light=make_shaded_light), 2.21),
     "E tilt 30": (Scene(tilt_y_deg=30, tilt_x_deg=5, roll_deg=20, distance_mm=1040), 2.47),
     "F tilt 45": (Scene(tilt_y_deg=45, distance_mm=1040), 2.76),
 }
@@ -67,7 +67,7 @@ def clean(name: str) -> Float:
 
 def start_from(scene: Scene, offset_px: float) -> EdgeState:
     """Rough ellipses: centres off by `offset_px`, blur 1.2, levels unknown."""
-    centres = true_centres_px(scene)
+    centres = compute_true_centres_px(scene)
     angle = np.arange(64) * (2 * np.pi / 64)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     parameters, scale = np.full((len(centres), 12), np.nan), np.empty(len(centres))
@@ -84,7 +84,7 @@ def start_from(scene: Scene, offset_px: float) -> EdgeState:
 
 def fit(scene: Scene, image: np.ndarray, start: EdgeState, noise: Noise | None = None) -> EdgeFit:
     camera = Noise(scene.read_DN**2 + 1 / 12, 1 / scene.electrons_per_DN)
-    return fit_edges(picture_of(image), start, noise or camera, np.tile([0.0, 2.3], (len(start.scale_px), 1)))
+    return fit_edges(make_picture(image), start, noise or camera, np.tile([0.0, 2.3], (len(start.scale_px), 1)))
 
 
 def rms_mpx(errors_px: Float) -> float:
@@ -93,7 +93,7 @@ def rms_mpx(errors_px: Float) -> float:
 
 def test_the_normal_distribution_and_its_density_are_right_to_2e_7():
     for t in np.linspace(-7, 7, 2001):
-        step, density = normal_distribution(t)
+        step, density = evaluate_normal_distribution(t)
         assert step == pytest.approx(0.5 * math.erfc(-t / math.sqrt(2)), abs=2e-7)
         assert density == pytest.approx(math.exp(-t * t / 2) / math.sqrt(2 * math.pi), abs=2e-7)
 
@@ -101,7 +101,7 @@ def test_the_normal_distribution_and_its_density_are_right_to_2e_7():
 def test_one_machine_code_fits_whatever_memory_the_reach_lies_in():
     """Another one would be compiled first, for a quarter of a minute."""
     scene = Scene(columns=3, rows=3, size=(300, 300))
-    start, image = start_from(scene, 0.3), picture_of(np.zeros((300, 300), np.uint8))
+    start, image = start_from(scene, 0.3), make_picture(np.zeros((300, 300), np.uint8))
     reach = np.tile([0.0, 2.3], (9, 1))
     fit_edges(image, start, Noise(1.0, 0.1), reach)
     reach.flags.writeable = False
@@ -113,7 +113,7 @@ def test_one_machine_code_fits_whatever_memory_the_reach_lies_in():
 def test_the_reference_renderer_puts_the_centroid_where_the_truth_says():
     scene = Scene(columns=3, rows=3, size=(900, 900), tilt_y_deg=30, roll_deg=10)
     light = scene.ground_DN - render(scene)
-    for x, y in true_centres_px(scene):
+    for x, y in compute_true_centres_px(scene):
         rows, columns = np.mgrid[round(y) - 60 : round(y) + 61, round(x) - 60 : round(x) + 61]
         weight = light[rows, columns]
         found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
@@ -124,14 +124,14 @@ def test_the_normal_equations_are_those_of_the_model():
     """J'We and J'WJ against numerical derivatives of the model; the terms left out are below 2 and 7 %."""
     truth = np.array([20.3, 19.8, 1.1, 0.08, 0.9, 1.1, 200, 3, -2, 30, 1, 1])
     away = truth + np.array([0.02, -0.03, 0.002, 0.001, -0.002, 0.02, 0.5, 0.1, 0.1, -0.3, 0.1, -0.1])
-    pixels = empty_pixels(41 * 41)
+    pixels = allocate_pixels(41 * 41)
     image, limits = np.zeros((41, 41), np.uint8), Limits(0.0, 0.5, 1.5, 1.6)
-    gather(picture_of(image), away[:5], 12.0, limits, 255, pixels)
+    gather(make_picture(image), away[:5], 12.0, limits, 255, pixels)
     values = [pixels.table[region, :, : pixels.counts[region]] for region in range(3)]
     for part in values:
         part[VALUE] = model(truth, in_image(part, pixels))
     normal, right = np.empty((12, 12)), np.empty(12)
-    squares, weights = normal_equations(pixels, away, 12.0, (1.0, 0.0), Work(normal, right), False)
+    squares, weights = build_normal_equations(pixels, away, 12.0, (1.0, 0.0), Work(normal, right), False)
     seen = in_image(np.concatenate(values, axis=1), pixels)
     residual = seen[VALUE] - model(away, seen)
     steps = 1e-5 * np.eye(12)
@@ -150,9 +150,9 @@ def test_pixels_are_gathered_by_where_they_lie_round_the_outline(
 ):
     """Each once, in the region that its F says, also where the image cuts them off."""
     shape, scale, limits = np.array([1.1, 0.08, 0.9]), 9.0, Limits(0.4, 0.7, 1.3, 1.7)
-    pixels = empty_pixels(41 * 41)
+    pixels = allocate_pixels(41 * 41)
     image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (41, 41), dtype)
-    gathered = gather(picture_of(image), np.array([*centre, *shape]), scale, limits, np.iinfo(dtype).max, pixels)
+    gathered = gather(make_picture(image), np.array([*centre, *shape]), scale, limits, np.iinfo(dtype).max, pixels)
     v, u = np.mgrid[:41, :41]
     x, y = (u - centre[0]) / scale, (v - centre[1]) / scale
     F = np.sqrt(shape[0] * x * x + 2 * shape[1] * x * y + shape[2] * y * y)
@@ -191,13 +191,15 @@ def test_a_noise_free_image_gives_the_true_centre_within_a_tenth_of_a_mpx(name: 
     fine = np.round(clean(name) * 200).astype(np.uint16)
     result = fit(scene, fine, start_from(scene, 1.0), Noise(1.0, 1 / 40))
     assert not result.flags.any()
-    assert rms_mpx(result.state.centres_px() - true_centres_px(scene)) < 0.1
+    assert rms_mpx(result.state.centres_px() - compute_true_centres_px(scene)) < 0.1
 
 
-@pytest.mark.parametrize("name", ["A even light", "F tilt 45", *map(by_night, ["B sharp", "D shaded", "E tilt 30"])])
+@pytest.mark.parametrize(
+    "name", ["A even light", "F tilt 45", *map(mark_nightly, ["B sharp", "D shaded", "E tilt 30"])]
+)
 def test_noisy_frames_scatter_at_the_physical_limit_and_the_covariance_says_so(name: str):
     scene, limit_mpx = SCENES[name]
-    truth, state = true_centres_px(scene), start_from(scene, 1.0)
+    truth, state = compute_true_centres_px(scene), start_from(scene, 1.0)
     errors: list[Float] = []
     variances: list[Float] = []
     for seed in range(4):
@@ -214,7 +216,7 @@ def test_noisy_frames_scatter_at_the_physical_limit_and_the_covariance_says_so(n
 
 def test_dots_of_seven_to_ten_pixels_keep_their_centre_and_an_honest_covariance():
     scene = Scene(size=(640, 480), f_px=1000, roll_deg=7, tilt_y_deg=20, psf_px=0.7)
-    truth, image = true_centres_px(scene), render(scene)
+    truth, image = compute_true_centres_px(scene), render(scene)
     start = start_from(scene, 0.3)
     assert 3.3 < start.radii_px().min() < start.radii_px().max() < 5
     fine = fit(scene, np.round(image * 200).astype(np.uint16), start, Noise(1.0, 1 / 40))
@@ -228,7 +230,7 @@ def test_dots_of_seven_to_ten_pixels_keep_their_centre_and_an_honest_covariance(
 
 def test_a_defocused_image_is_gathered_again_in_a_wider_band():
     scene = Scene(columns=3, rows=3, size=(800, 800), psf_px=3.0)
-    truth = true_centres_px(scene)
+    truth = compute_true_centres_px(scene)
     result = fit(scene, photograph(scene, render(scene), 1), start_from(scene, 1.0))
     assert not result.flags.any()
     np.testing.assert_allclose(result.state.parameters[:, SIGMA], math.hypot(3, 1 / math.sqrt(12)), rtol=0.02)
@@ -251,7 +253,7 @@ def test_an_overexposed_ground_is_flagged_and_does_not_shift_the_centres(from_ab
         image, noise = image.astype(np.uint16) << 8, Noise(noise.floor_DN2 * 256**2, noise.slope_DN * 256)
     result = fit(scene, image, start_from(scene, 0.5), noise)
     assert np.all(result.flags == Flag.SATURATED)
-    assert rms_mpx(result.state.centres_px() - true_centres_px(scene)) < 5
+    assert rms_mpx(result.state.centres_px() - compute_true_centres_px(scene)) < 5
 
 
 def test_the_fit_reads_its_inputs_only():

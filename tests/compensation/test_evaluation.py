@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.evaluation import evaluate, improvement_percent, table
+from thermostand.compensation.drift.evaluation import compute_improvement_percent, evaluate, format_table
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.observations import Observations
 from thermostand.foundation.errors import SessionError
@@ -93,14 +93,14 @@ def test_the_table_stands_beside_the_papers(night: Observations, model: PaperMod
     exact = replace(
         evaluate(model, night), before_px=np.array([[0.2, -0.5]]), after_px=np.array([[-0.01, 0.05]]), frames=12
     )
-    assert table(exact).splitlines()[1:] == [
+    assert format_table(exact).splitlines()[1:] == [
         "                                 along I                       along J",
         "                  before     after    gain      before     after    gain",
         "paper              0.191     0.100    48 %       0.576     0.090    84 %",
         "this session       0.200     0.010    95 %       0.500     0.050    90 %",
         "12 frames; held-out temperatures",
     ]
-    assert table(replace(exact, simulated=True)).splitlines()[1:] == [
+    assert format_table(replace(exact, simulated=True)).splitlines()[1:] == [
         "                                             along I                       along J",
         "                              before     after    gain      before     after    gain",
         "paper                          0.191     0.100    48 %       0.576     0.090    84 %",
@@ -110,5 +110,5 @@ def test_the_table_stands_beside_the_papers(night: Observations, model: PaperMod
 
 
 def test_growth_is_a_negative_gain():
-    assert improvement_percent(0.1, 0.2) == pytest.approx(-100)
-    assert np.isnan(improvement_percent(0.0, 0.2))
+    assert compute_improvement_percent(0.1, 0.2) == pytest.approx(-100)
+    assert np.isnan(compute_improvement_percent(0.0, 0.2))

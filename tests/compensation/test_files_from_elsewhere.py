@@ -22,13 +22,19 @@ from typer.testing import CliRunner
 
 import thermostand
 from thermostand.compensation import cli
-from thermostand.compensation.apply.runtime_export import runtime_model
+from thermostand.compensation.apply.runtime_export import build_runtime_model
 from thermostand.compensation.calibration.calibrate import Model, calibrate
-from thermostand.compensation.calibration.camera_file import camera_file
+from thermostand.compensation.calibration.camera_file import build_camera_file
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift_runtime import Drift
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.files import check_folder_writable, check_writable, make_folder, whole_file, write_whole
+from thermostand.foundation.files import (
+    check_folder_writable,
+    check_writable,
+    make_folder,
+    open_atomic,
+    write_atomically,
+)
 
 from .calibration_truth import Truth, draw, positions, target_of
 from .made_up_models import paper, thermal
@@ -146,10 +152,10 @@ def saved(model: DriftModel, folder: Path) -> Path:
 def good_camera(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("camera") / "good.json"
     laboratory = draw(Truth(seed=1))
-    seen = positions(laboratory).part(np.arange(34) % 4 == 0)
+    seen = positions(laboratory).select(np.arange(34) % 4 == 0)
     found = calibrate(seen, target_of(laboratory), model=Model.BROWN)
     made = {"camera_serial": "C", "session_ids": ("s",), "target_name": "t", "software_version": "0"}
-    camera_file(found, **made).save(path)
+    build_camera_file(found, **made).save(path)
     return path
 
 
@@ -197,7 +203,7 @@ def test_a_camera_with_numbers_that_cannot_be_is_refused(what: str, good_camera:
 @pytest.mark.parametrize("what", RUNTIME)
 def test_a_run_time_file_with_numbers_that_cannot_be_is_refused(what: str, tmp_path: Path):
     change, sentence = RUNTIME[what]
-    data = json.loads(json.dumps(runtime_model(thermal())))
+    data = json.loads(json.dumps(build_runtime_model(thermal())))
     Drift(data)
     change(data)
     path = tmp_path / "drift.json"
@@ -268,7 +274,7 @@ def pipe(tmp_path: Path) -> Path:
 
 
 def test_a_pipe_is_refused_and_stays_a_pipe(pipe: Path):
-    for write in (check_writable, lambda path: write_whole(path, "text")):
+    for write in (check_writable, lambda path: write_atomically(path, "text")):
         with pytest.raises(SessionError, match=r"pipe: .*not a regular file"):
             write(pipe)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
@@ -279,13 +285,13 @@ def test_a_link_to_a_pipe_is_refused_too(pipe: Path):
     link = pipe.with_name("link")
     link.symlink_to(pipe)
     with pytest.raises(SessionError, match="link: cannot be written"):
-        write_whole(link, "text")
+        write_atomically(link, "text")
     assert link.is_symlink()
 
 
 def test_a_folder_is_refused(tmp_path: Path):
     (tmp_path / "folder").mkdir()
-    for write in (check_writable, lambda path: write_whole(path, "text")):
+    for write in (check_writable, lambda path: write_atomically(path, "text")):
         with pytest.raises(SessionError, match=r"folder: cannot be written \(it is a folder\)"):
             write(tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
@@ -295,7 +301,7 @@ def test_a_pipe_that_appears_during_the_work_is_refused_at_the_rename(tmp_path: 
     out = tmp_path / "out"
 
     def write() -> None:
-        with whole_file(out) as file:
+        with open_atomic(out) as file:
             file.write("text")
             os.mkfifo(out)
 
@@ -308,7 +314,7 @@ def test_a_pipe_that_appears_during_the_work_is_refused_at_the_rename(tmp_path: 
 def test_a_file_is_replaced_when_the_block_has_ended_and_not_before(tmp_path: Path):
     out = tmp_path / "out"
     out.write_text("older")
-    with whole_file(out) as file:
+    with open_atomic(out) as file:
         file.write("a\r\nb\n")
         assert out.read_text() == "older"
     assert out.read_bytes() == b"a\r\nb\n"

@@ -17,15 +17,21 @@ import numpy as np
 import psutil
 import pytest
 
-from thermostand.compensation.finding.finder import Finder, finder, keep, kept
-from thermostand.compensation.finding.piece import FoundMarkers, Piece, find_markers, joined, pieces_of
-from thermostand.compensation.finding.workers import find_to_file, in_processes, in_turn, on_cluster
-from thermostand.compensation.observations import session_target
+from thermostand.compensation.finding.finder import Finder, finder, load_markers, save_markers
+from thermostand.compensation.finding.piece import (
+    FoundMarkers,
+    Piece,
+    concatenate_markers,
+    find_markers,
+    split_into_pieces,
+)
+from thermostand.compensation.finding.workers import find_in_turn, find_to_file, make_cluster_work, make_process_work
+from thermostand.compensation.observations import read_session_target
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.markers.detection import detect
 from thermostand.markers.noise import Noise
 from thermostand.recording.format.mcap_bytes import RECORD
-from thermostand.recording.format.records import frame_places
+from thermostand.recording.format.records import list_frame_places
 from thermostand.recording.reading.session import Session
 
 from .conftest import TARGET_YAML, Recorded, record
@@ -37,12 +43,12 @@ HEAD_BYTES = 64
 @pytest.fixture(scope="module")
 def pieces(recorded: Recorded) -> list[Piece]:
     session = Session.open(recorded.path)
-    return pieces_of(session, session_target(session), frames_per_piece=5)
+    return split_into_pieces(session, read_session_target(session), frames_per_piece=5)
 
 
 @pytest.fixture(scope="module")
 def serial(pieces: list[Piece]) -> list[FoundMarkers]:
-    return [found for _, found in in_turn(pieces)]
+    return [found for _, found in find_in_turn(pieces)]
 
 
 def assert_same(one: FoundMarkers, other: FoundMarkers) -> None:
@@ -60,13 +66,13 @@ def assert_all_same(found: dict[int, FoundMarkers], serial: list[FoundMarkers]) 
 def test_the_pieces_of_a_session_are_all_its_frames_once_and_in_order(recorded: Recorded, pieces: list[Piece]):
     session = Session.open(recorded.path)
     assert [piece.frames for piece in pieces] == [5, 5, 5, session.frame_count - 15]
-    found = joined([find_markers(piece) for piece in reversed(pieces)])
+    found = concatenate_markers([find_markers(piece) for piece in reversed(pieces)])
     assert np.array_equal(found.time_ns, session.frame_times_ns)
     assert np.array_equal(found.block, [frame.block_id & 0xFFFFFFFF for frame in session.frames()])
 
 
 def test_what_is_found_is_near_the_truth_and_a_dark_frame_has_its_reason(recorded: Recorded, pieces: list[Piece]):
-    found = joined([find_markers(piece) for piece in pieces])
+    found = concatenate_markers([find_markers(piece) for piece in pieces])
     (dark,) = np.flatnonzero(found.reason != "")
     assert "found 0 of 54" in found.reason[dark]
     seen = found.flags == 0
@@ -84,7 +90,7 @@ async def test_frames_decoded_in_part_give_what_whole_images_give(
     if bits > 8:
         await record(tmp_path / "deep", {"target.yaml": TARGET_YAML}, frames=3, bits=bits)
         session = Session.open(tmp_path / "deep")
-        (piece,) = pieces_of(session, session_target(session), frames_per_piece=5)
+        (piece,) = split_into_pieces(session, read_session_target(session), frames_per_piece=5)
     found, previous = find_markers(piece), None
     for number, frame in enumerate(islice(session.frames(), len(found.centres_px))):
         assert frame.image.itemsize == -(-bits // 8)
@@ -94,12 +100,12 @@ async def test_frames_decoded_in_part_give_what_whole_images_give(
 
 
 def test_processes_find_the_same_bits(pieces: list[Piece], serial: list[FoundMarkers]):
-    assert_all_same(dict(in_processes(2)(pieces)), serial)
+    assert_all_same(dict(make_process_work(2)(pieces)), serial)
 
 
 def test_a_killed_process_loses_nothing(pieces: list[Piece], serial: list[FoundMarkers]):
     found: dict[int, FoundMarkers] = {}
-    for index, markers in in_processes(2)(pieces):
+    for index, markers in make_process_work(2)(pieces):
         if not found:
             for child in multiprocessing.active_children():
                 child.kill()
@@ -119,9 +125,9 @@ def test_what_a_process_answers_fits_into_one_write_of_a_pipe(
 
 OWNER = """if True:
     import os, time
-    from thermostand.compensation.finding.workers import pool
+    from thermostand.compensation.finding.workers import open_pool
     if __name__ == "__main__":
-        with pool(1) as processes:
+        with open_pool(1) as processes:
             print(processes.submit(os.getpid).result(), flush=True)
             time.sleep(60)
 """
@@ -150,13 +156,13 @@ class Poison(Piece):
 def test_a_piece_that_kills_its_workers_ends_with_a_sentence(pieces: list[Piece]):
     poison = Poison(*(getattr(pieces[0], field.name) for field in fields(Piece)))
     with pytest.raises(SessionError, match=r"0000\.mcap: the processes .* are killed each time; .* fewer --workers"):
-        list(in_processes(1)([poison]))
+        list(make_process_work(1)([poison]))
 
 
 def test_a_segment_that_cannot_be_read_ends_the_work_with_its_sentence(pieces: list[Piece], tmp_path: Path):
     lost = replace(pieces[0], segment=tmp_path / "lost.mcap")
     with pytest.raises(SessionError, match=r"lost\.mcap"):
-        list(in_processes(2)([lost, *pieces]))
+        list(make_process_work(2)([lost, *pieces]))
 
 
 def test_a_cluster_finds_the_same_bits_also_when_a_worker_is_killed(pieces: list[Piece], serial: list[FoundMarkers]):
@@ -169,7 +175,7 @@ def test_a_cluster_finds_the_same_bits_also_when_a_worker_is_killed(pieces: list
         ) as here,
     ):
         found: dict[int, FoundMarkers] = {}
-        for index, markers in on_cluster(here.scheduler_address)(pieces):
+        for index, markers in make_cluster_work(here.scheduler_address)(pieces):
             if not found:
                 psutil.Process(here.workers[0].pid).kill()
             found[index] = markers
@@ -178,7 +184,7 @@ def test_a_cluster_finds_the_same_bits_also_when_a_worker_is_killed(pieces: list
 
 def test_a_cluster_that_does_not_answer_is_named(pieces: list[Piece]):
     with pytest.raises(ConfigError, match=r"--cluster 127\.0\.0\.1:9: no Dask scheduler"):
-        list(on_cluster("127.0.0.1:9", wait_s=0.2)(pieces))
+        list(make_cluster_work("127.0.0.1:9", wait_s=0.2)(pieces))
 
 
 def nobody(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
@@ -191,11 +197,11 @@ def test_what_was_found_is_kept_also_for_a_copy_elsewhere(
     recorded: Recorded, pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
 ):
     reported: list[int] = []
-    first = Finder(in_turn, tmp_path / "kept")(pieces, reported.append)
+    first = Finder(find_in_turn, tmp_path / "kept")(pieces, reported.append)
     assert reported == [0, 5, 10, 15, sum(piece.frames for piece in pieces)]
     shutil.copytree(recorded.path, tmp_path / "copy")
     session = Session.open(tmp_path / "copy")
-    copies = pieces_of(session, session_target(session), frames_per_piece=5)
+    copies = split_into_pieces(session, read_session_target(session), frames_per_piece=5)
     again = Finder(nobody, tmp_path / "kept")(copies, reported.append)
     for one, other, expected in zip(first, again, serial, strict=True):
         assert_same(one, expected)
@@ -203,10 +209,10 @@ def test_what_was_found_is_kept_also_for_a_copy_elsewhere(
 
 
 def test_another_content_target_noise_or_range_is_found_again(pieces: list[Piece], tmp_path: Path):
-    Finder(in_turn, tmp_path / "kept")(pieces[:1], lambda done: None)
+    Finder(find_in_turn, tmp_path / "kept")(pieces[:1], lambda done: None)
     changed = tmp_path / "changed.mcap"
     content = bytearray(pieces[0].segment.read_bytes())
-    content[frame_places(pieces[0].segment)[2].chunk.offset + RECORD.size + CRC_AT] ^= 1
+    content[list_frame_places(pieces[0].segment)[2].chunk.offset + RECORD.size + CRC_AT] ^= 1
     changed.write_bytes(content)
     others = [
         replace(pieces[0], segment=changed),
@@ -224,9 +230,9 @@ def test_frames_whose_markers_are_kept_are_not_read_again(
     pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
 ):
     pieces = [piece for piece in pieces if piece.segment == pieces[0].segment]
-    Finder(in_turn, tmp_path / "kept")(pieces, lambda done: None)
+    Finder(find_in_turn, tmp_path / "kept")(pieces, lambda done: None)
     content = bytearray(pieces[0].segment.read_bytes())
-    for place in frame_places(pieces[0].segment):
+    for place in list_frame_places(pieces[0].segment):
         begin, end = place.chunk.offset + HEAD_BYTES, place.chunk.offset + place.chunk.length
         content[begin:end] = bytes(end - begin)
     emptied = tmp_path / "emptied.mcap"
@@ -237,12 +243,12 @@ def test_frames_whose_markers_are_kept_are_not_read_again(
 
 
 def test_what_is_kept_but_damaged_is_found_again(pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path):
-    Finder(in_turn, tmp_path)(pieces[:1], lambda done: None)
+    Finder(find_in_turn, tmp_path)(pieces[:1], lambda done: None)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
     for damaged in (b"", whole[: len(whole) // 2], b"no archive", whole.replace(b"flags", b"flogs")):
         file.write_bytes(damaged)
-        (found,) = Finder(in_turn, tmp_path)(pieces[:1], lambda done: None)
+        (found,) = Finder(find_in_turn, tmp_path)(pieces[:1], lambda done: None)
         assert_same(found, serial[0])
         assert file.read_bytes() == whole
 
@@ -251,9 +257,9 @@ def test_a_place_that_cannot_be_written_keeps_nothing_and_stops_nobody(
     pieces: list[Piece], serial: list[FoundMarkers], tmp_path: Path
 ):
     (tmp_path / "file").write_text("")
-    keep(tmp_path / "file", "key", serial[0])
-    assert kept(tmp_path / "file", "key") is None
-    (found,) = Finder(in_turn, tmp_path / "file" / "below")(pieces[:1], lambda done: None)
+    save_markers(tmp_path / "file", "key", serial[0])
+    assert load_markers(tmp_path / "file", "key") is None
+    (found,) = Finder(find_in_turn, tmp_path / "file" / "below")(pieces[:1], lambda done: None)
     assert_same(found, serial[0])
 
 

@@ -8,12 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.nightly import by_night
-from thermostand.markers.bootstrap import Candidates
-from thermostand.markers.grid import DetectionError, Identified, identify, placements, roll_deg
+from tests.nightly import mark_nightly
+from thermostand.markers.candidate_search import Candidates
+from thermostand.markers.grid_identification import (
+    DetectionError,
+    Identified,
+    compute_roll_deg,
+    find_placements,
+    identify,
+)
 from thermostand.markers.target import OddMarker, Target, load_target
 
-from .rendered import Float, Scene, true_centres_px
+from .renderer import Float, Scene, compute_true_centres_px
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
 SQUARE = Target(name="square", columns=6, rows=6, pitch_mm=30, diameter_mm=8)
@@ -23,7 +29,7 @@ ODD = SQUARE.model_copy(update={"odd_marker": OddMarker(number=1, diameter_mm=14
 def seen(scene: Scene, seed: int = 0, missing: Sequence[int] = (), clutter: int = 0) -> tuple[Candidates, Float]:
     """Shuffled, slightly wrong candidates of a scene without `missing`, and the true centres in order."""
     rng = np.random.default_rng(seed)
-    truth = true_centres_px(scene)
+    truth = compute_true_centres_px(scene)
     areas = np.array([np.pi / 4 * (disc[2] * scene.f_px / scene.distance_mm) ** 2 for disc in scene.discs_mm()])
     kept = np.setdiff1d(np.arange(len(truth)), np.array(missing, dtype=int) - 1)
     strewn = rng.uniform(truth.min(axis=0) - 200, truth.max(axis=0) + 200, (clutter, 2))
@@ -60,7 +66,7 @@ def test_every_marker_is_identified_in_every_pose(pose: str):
     found = identify(candidates, PAPER)
     assert (found.candidate >= 0).all()
     assert wrong(found, candidates, truth) == 0
-    assert roll_deg(found.homography, PAPER) == pytest.approx(POSES[pose].roll_deg, abs=3)
+    assert compute_roll_deg(found.homography, PAPER) == pytest.approx(POSES[pose].roll_deg, abs=3)
 
 
 @pytest.mark.parametrize("missing", [(1,), (9,), (20,), (54,), (3, 20, 33, 50)])
@@ -132,7 +138,7 @@ def test_a_missing_column_is_refused_and_the_frame_before_settles_it():
     assert wrong(found, candidates, truth) == 0
 
 
-@pytest.mark.parametrize("seeds", [range(6), by_night(range(6, 12))])
+@pytest.mark.parametrize("seeds", [range(6), mark_nightly(range(6, 12))])
 def test_a_side_that_clutter_hides_is_found_or_refused_and_never_read_one_column_off(seeds: range):
     outcomes: list[int] = []
     for seed in seeds:
@@ -147,11 +153,11 @@ def test_a_side_that_clutter_hides_is_found_or_refused_and_never_read_one_column
 
 
 def test_a_growth_that_missed_a_column_and_went_on_into_clutter_is_set_right():
-    truth = true_centres_px(Scene(roll_deg=5))
+    truth = compute_true_centres_px(Scene(roll_deg=5))
     beyond = 2 * truth[8] - truth[7]
     points = np.vstack([truth, beyond])
     lattice = {(n % 9, n // 9): n for n in range(54) if n % 9} | {(9, 0): 54}
-    best = min(placements(lattice, points, PAPER), key=lambda p: p.residual_px)
+    best = min(find_placements(lattice, points, PAPER), key=lambda p: p.residual_px)
     assert sorted(best.candidate) == list(range(54))
 
 
@@ -171,7 +177,7 @@ def test_targets_of_any_size_are_identified_through_a_wide_lens(columns: int, ro
     pose = Scene(
         columns=columns, rows=rows, pitch_mm=target.pitch_mm, diameter_mm=2, f_px=2600, distance_mm=330, k1=-0.25
     )
-    truth = true_centres_px(pose)
+    truth = compute_true_centres_px(pose)
     order = np.random.default_rng(1).permutation(len(truth))
     candidates = Candidates(truth[order], np.full(len(truth), 100.0), np.zeros(len(truth)))
     found = identify(candidates, target)

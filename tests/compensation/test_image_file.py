@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.image_limit import images_up_to
+from thermostand.foundation.image_limit import allow_images_up_to
 from thermostand.markers.detection import DetectionError
 from thermostand.markers.image_file import read_image
 from thermostand.recording.format.images import decode_image
@@ -99,7 +99,7 @@ def test_what_is_read_may_be_chosen(tmp_path: Path):
     said = detect(path, "-o", out, "--max-megapixels", "0.9")
     assert said.startswith(f"error: {path}: claims 1000 x 1000 px; up to 0.9 megapixels are read")
     assert "found 0 of 54 markers" in detect(path, "-o", out, "--max-megapixels", "1")
-    with images_up_to(100):
+    with allow_images_up_to(100):
         path.write_bytes(png(9_000, 9_000))
         assert read_image(path).shape == (9_000, 9_000)
 

@@ -16,26 +16,26 @@ import pytest
 from numpy.typing import NDArray
 
 from thermostand.foundation.errors import SessionError
-from thermostand.markers.bootstrap import Candidates
+from thermostand.markers.candidate_search import Candidates
 from thermostand.markers.detection import (
     Detection,
     DetectionError,
     Flag,
     Noise,
+    convert_to_grey,
     detect,
     follow,
-    grey_image,
-    rows_to_follow,
+    predict_rows,
 )
-from thermostand.markers.detections_table import COLUMNS, DetectedImage, flags_text, write_detections
-from thermostand.markers.eccentricity import disc_centres
-from thermostand.markers.grid import identify
+from thermostand.markers.detections_table import COLUMNS, DetectedImage, format_flags, write_detections
+from thermostand.markers.eccentricity import compute_disc_centres
+from thermostand.markers.grid_identification import identify
+from thermostand.markers.homography import fit_homography, project
 from thermostand.markers.image_file import read_image
-from thermostand.markers.plane import fit_homography, project
 from thermostand.markers.target import OddMarker, Target, load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
-from .rendered import Float, Scene, photograph, render, true_centres_px
+from .renderer import Float, Scene, compute_true_centres_px, photograph, render
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
 HALF = Scene(size=(1224, 1024), f_px=4386)
@@ -54,7 +54,7 @@ def further_away() -> Detection:
 
 
 def rms_mpx(detection: Detection, scene: Scene) -> float:
-    return 1e3 * float(np.sqrt(np.nanmean((detection.centres_px - true_centres_px(scene)) ** 2)))
+    return 1e3 * float(np.sqrt(np.nanmean((detection.centres_px - compute_true_centres_px(scene)) ** 2)))
 
 
 @pytest.mark.parametrize(
@@ -100,11 +100,11 @@ def test_a_target_is_followed_by_its_rows_alone_to_the_same_bits(what: str):
     clean = render(scene) if scene.missing else half_frame().copy()
     first = detect(photograph(scene, clean, 1), PAPER, noise=CAMERA)
     if what == "glare":
-        x, y = true_centres_px(HALF)[30]
+        x, y = compute_true_centres_px(HALF)[30]
         v, u = np.indices(clean.shape)
         clean += 400 * np.exp(-((u - x - 17) ** 2 + (v - y) ** 2) / (2 * 7.0**2))
     image = np.asarray(photograph(scene, clean, 2), np.uint8)
-    rows = rows_to_follow(first, PAPER, len(image))
+    rows = predict_rows(first, PAPER, len(image))
     assert 0.3 < rows.mean() < 0.6
     others = np.random.default_rng(1).integers(0, 256, image.shape, np.uint8)
     followed = follow(np.where(rows[:, None], image, others), rows, PAPER, first, CAMERA)
@@ -117,7 +117,7 @@ def test_a_target_is_followed_by_its_rows_alone_to_the_same_bits(what: str):
 def test_a_target_that_takes_more_rows_is_not_followed():
     first = half_tracked()
     image = np.asarray(photograph(HALF, half_frame(), 2), np.uint8)
-    rows = rows_to_follow(first, PAPER, len(image))
+    rows = predict_rows(first, PAPER, len(image))
     assert follow(image, rows, PAPER, first, CAMERA) is not None
     for row in np.flatnonzero(np.diff(rows.astype(int)) > 0) + 6:  # the first rows of the bands
         without = rows.copy()
@@ -150,9 +150,11 @@ def test_a_missing_marker_is_nan_flagged_and_looked_for_again():
 
 def test_a_disc_cut_by_the_border_is_missing_and_one_near_it_is_flagged():
     scene = dataclasses.replace(HALF, roll_deg=6)
-    beyond_px = true_centres_px(scene)[45, 0] - 5
+    beyond_px = compute_true_centres_px(scene)[45, 0] - 5
     scene = dataclasses.replace(scene, shift_mm=(-beyond_px * scene.distance_mm / scene.f_px, 0))
-    assert true_centres_px(scene)[[45, 36], 0] == pytest.approx([5, 19], abs=1)  # the discs are 17.5 px in radius
+    assert compute_true_centres_px(scene)[[45, 36], 0] == pytest.approx(
+        [5, 19], abs=1
+    )  # the discs are 17.5 px in radius
     found = detect(photograph(scene, render(scene), 1), PAPER, noise=CAMERA)
     assert np.flatnonzero(found.flags).tolist() == [36, 45]
     assert found.flags[36] == Flag.BORDER
@@ -163,7 +165,7 @@ def test_a_disc_cut_by_the_border_is_missing_and_one_near_it_is_flagged():
 
 def test_glare_on_an_outline_flags_that_marker_and_no_other():
     image = half_frame().copy()
-    x, y = true_centres_px(HALF)[30]
+    x, y = compute_true_centres_px(HALF)[30]
     v, u = np.indices(image.shape)
     image += 400 * np.exp(-((u - x - 17) ** 2 + (v - y) ** 2) / (2 * 7.0**2))
     found = detect(photograph(HALF, image, 1), PAPER, noise=CAMERA)
@@ -181,7 +183,7 @@ def spoiled(seed: int) -> tuple[Float, NDArray[np.intp]]:
     """Eight glare spots of 2..600 DN and eight straight occluders at random places round random outlines: the image
     without noise, and the numbers of the markers, glare first."""
     rng = np.random.default_rng(seed)
-    image, truth = half_frame().copy(), true_centres_px(HALF)
+    image, truth = half_frame().copy(), compute_true_centres_px(HALF)
     hit = rng.choice(54, 16, replace=False)
     for n in hit[:8]:
         angle, away, width = rng.uniform(0, 2 * np.pi), rng.uniform(8, 32), rng.uniform(2, 14)
@@ -207,7 +209,7 @@ def around(centre: Float, half_px: int) -> tuple[NDArray[np.intp], NDArray[np.in
 
 def sigmas(found: Detection, which: NDArray[np.intp]) -> Float:
     """How many of its own standard deviations each centre is off."""
-    error = (found.centres_px - true_centres_px(HALF))[which]
+    error = (found.centres_px - compute_true_centres_px(HALF))[which]
     return np.sqrt(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2[which]), error))
 
 
@@ -232,14 +234,14 @@ def test_no_marker_that_glare_or_an_occluder_spoils_is_silently_wrong(images: ra
 
 def test_a_sheet_over_a_quarter_of_each_disc_of_a_column_leaves_them_within_five_of_their_sigmas():
     image, column = half_frame().copy(), np.arange(0, 54, 9)
-    image[:, : int(true_centres_px(HALF)[0, 0] - 7)] = 90
+    image[:, : int(compute_true_centres_px(HALF)[0, 0] - 7)] = 90
     found = detect(photograph(HALF, image, 1), PAPER, half_tracked(), CAMERA)
     assert np.all(found.flags[column] == Flag.REFITTED)
     assert sigmas(found, column).max() < 5
 
 
 def test_a_marker_hidden_to_two_thirds_keeps_its_flag():
-    image, (x, y) = half_frame().copy(), true_centres_px(HALF)[20]
+    image, (x, y) = half_frame().copy(), compute_true_centres_px(HALF)[20]
     v, u = around(np.array([x, y]), 40)
     image[v, u] = np.where(np.arctan2(v - y, u - x) > -np.pi / 3, 90, image[v, u])
     found = detect(photograph(HALF, image, 1), PAPER, half_tracked(), CAMERA)
@@ -251,7 +253,7 @@ def test_a_few_markers_cannot_vouch_for_another_ones_shape():
     """Seven clean ones of a 4 x 2 target: the spoiled one stays poor."""
     scene = dataclasses.replace(HALF, columns=4, rows=2)
     target = PAPER.model_copy(update={"columns": 4, "rows": 2})
-    image, (x, y) = render(scene), true_centres_px(scene)[5]
+    image, (x, y) = render(scene), compute_true_centres_px(scene)[5]
     image[int(y - 4) : int(y + 4), int(x + 12) : int(x + 22)] = 120
     found = detect(photograph(scene, image, 1), target, noise=CAMERA)
     assert found.flags.tolist() == [0, 0, 0, 0, 0, Flag.POOR_FIT, 0, 0]
@@ -319,7 +321,7 @@ def test_the_image_is_only_read():
 def test_what_is_no_image_is_a_programming_mistake():
     for wrong in (np.zeros((4, 4), np.float64), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4), np.uint8)):
         with pytest.raises(ValueError, match="an image"):
-            grey_image(wrong)  # pyright: ignore[reportArgumentType] - wrong on purpose
+            convert_to_grey(wrong)  # pyright: ignore[reportArgumentType] - wrong on purpose
 
 
 def test_image_files_are_read_as_grey_and_bad_ones_get_a_sentence(tmp_path: Path):
@@ -352,7 +354,7 @@ def test_the_table_has_a_row_per_marker_with_the_agreed_columns(tmp_path: Path):
     assert rows[54]["time_ns"] == "123"
     assert [float(rows[9]["x_px"]), float(rows[9]["y_px"])] == pytest.approx(found.centres_px[9], abs=1e-6)
     assert float(rows[9]["cov_xy_px2"]) == pytest.approx(found.covariance_px2[9, 0, 1], rel=1e-6)
-    discs_px, discs_px2 = disc_centres(found, PAPER)
+    discs_px, discs_px2 = compute_disc_centres(found, PAPER)
     assert [float(rows[9]["disc_x_px"]), float(rows[9]["disc_y_px"])] == pytest.approx(discs_px[9], abs=1e-6)
     assert float(rows[9]["disc_var_y_px2"]) == pytest.approx(discs_px2[9, 1, 1], rel=1e-6)
     assert rows[53]["x_px"] == rows[53]["disc_x_px"] == rows[53]["disc_var_x_px2"] == "nan"
@@ -360,8 +362,8 @@ def test_the_table_has_a_row_per_marker_with_the_agreed_columns(tmp_path: Path):
 
 
 def test_flags_are_written_as_names():
-    assert flags_text(0) == "OK"
-    assert flags_text(Flag.POOR_FIT | Flag.BORDER) == "POOR_FIT|BORDER"
+    assert format_flags(0) == "OK"
+    assert format_flags(Flag.POOR_FIT | Flag.BORDER) == "POOR_FIT|BORDER"
 
 
 def test_nothing_half_written_is_left_when_an_image_fails(tmp_path: Path):
@@ -383,7 +385,7 @@ def test_nothing_half_written_is_left_when_an_image_fails(tmp_path: Path):
 # Images that show no target, or one that no camera sees so, end in a sentence and soon.
 
 
-TARGET = load_target(packaged("targets", "paper-9x6"))
+TARGET = load_target(find_packaged("targets", "paper-9x6"))
 LONGEST_CPU_S = 30.0
 
 

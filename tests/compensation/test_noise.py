@@ -5,15 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.nightly import by_night
-from thermostand.markers.noise import _order, estimate_noise, full_scale_DN
+from tests.nightly import mark_nightly
+from thermostand.markers.noise import _sort_indices, estimate_noise, find_full_scale_DN
 
-from .rendered import Scene, photograph, render, shaded_light
+from .renderer import Scene, make_shaded_light, photograph, render
 
-SCENE = Scene(columns=5, rows=4, size=(1000, 800), ground_DN=150, light=shaded_light)
+SCENE = Scene(columns=5, rows=4, size=(1000, 800), ground_DN=150, light=make_shaded_light)
 
 
-@pytest.mark.parametrize(("read_DN", "electrons_per_DN"), [(1.0, 40.0), by_night(3.0, 100.0), by_night(0.7, 10.0)])
+@pytest.mark.parametrize(
+    ("read_DN", "electrons_per_DN"), [(1.0, 40.0), mark_nightly(3.0, 100.0), mark_nightly(0.7, 10.0)]
+)
 def test_read_noise_and_shot_noise_are_found_while_the_target_drifts(read_DN, electrons_per_DN):
     scenes = [
         dataclasses.replace(SCENE, shift_mm=(0.03 * k, 0), read_DN=read_DN, electrons_per_DN=electrons_per_DN)
@@ -29,7 +31,7 @@ def test_read_noise_and_shot_noise_are_found_while_the_target_drifts(read_DN, el
 def test_means_are_put_in_the_order_of_a_stable_sort(values):
     """Of 8 bit, of 12 bit, and such as no mean of whole pixels is."""
     signal = np.random.default_rng(1).choice(values, 5000).astype(np.float32)
-    assert np.array_equal(_order(signal), np.argsort(signal, kind="stable"))
+    assert np.array_equal(_sort_indices(signal), np.argsort(signal, kind="stable"))
 
 
 def test_light_that_changed_between_the_images_does_not_count_as_noise():
@@ -61,11 +63,11 @@ def test_one_image_tells_nothing_and_neither_do_two_of_different_size():
     ("brightest", "full_scale"), [(90, 255), (700, 1023), (1800, 4095), (4095, 4095), (60000, 65535)]
 )
 def test_the_full_scale_of_16_bits_is_that_of_a_camera(brightest, full_scale):
-    assert full_scale_DN(np.array([[1, brightest]], np.uint16)) == full_scale
-    assert full_scale_DN(np.array([[90]], np.uint8)) == 255
+    assert find_full_scale_DN(np.array([[1, brightest]], np.uint16)) == full_scale
+    assert find_full_scale_DN(np.array([[90]], np.uint8)) == 255
 
 
 @pytest.mark.parametrize(("depth", "full_scale"), [(12, 65520), (10, 65472)])
 def test_a_camera_that_fills_16_bits_from_above_is_recognised_by_the_bits_it_leaves_empty(depth, full_scale):
     values = np.arange(1 << depth, dtype=np.uint16)[::7, None] << (16 - depth)
-    assert full_scale_DN(values) == full_scale
+    assert find_full_scale_DN(values) == full_scale

@@ -13,23 +13,29 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from thermostand.compensation.camera_selection import find_camera_name, list_camera_frames, select_camera
 from thermostand.compensation.cli import app
-from thermostand.compensation.drift.displacements import displacements, reference_centres
-from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.displacements import average_reference_centres, compute_displacements
+from thermostand.compensation.drift.model_facts import ModelFacts
 from thermostand.compensation.drift.model_file import save_model
-from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, exponents
-from thermostand.compensation.history.thermal_history import recorded_history
-from thermostand.compensation.observations import Observations, concatenate, observe, observe_session, session_target
-from thermostand.compensation.one_camera import name_of, own_frames, take
+from thermostand.compensation.drift.paper_model import DegreeScore, PaperModel, list_exponents
+from thermostand.compensation.history.thermal_history import read_history
+from thermostand.compensation.observations import (
+    Observations,
+    concatenate,
+    observe,
+    observe_session,
+    read_session_target,
+)
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.instants import local_text
+from thermostand.foundation.instants import format_local
 from thermostand.foundation.items import Batch, Item
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.detection import Flag
-from thermostand.recording.format.records import frame_places
-from thermostand.recording.format.restarts import restarted
+from thermostand.recording.format.capture_restarts import make_restart_event
+from thermostand.recording.format.records import list_frame_places
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
 
@@ -41,7 +47,7 @@ from .synthetic import facts, observations, quadratic
 @pytest.fixture(scope="module")
 def observed(recorded: Recorded) -> Observations:
     session = Session.open(recorded.path)
-    return observe_session(session, session_target(session))
+    return observe_session(session, read_session_target(session))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +99,7 @@ def test_air_is_interpolated_between_readings_and_unknown_after_the_last(observe
 
 def test_progress_counts_frames(recorded: Recorded):
     session, reported = Session.open(recorded.path), list[tuple[float, str]]()
-    observe_session(session, session_target(session), report=lambda done, text: reported.append((done, text)))
+    observe_session(session, read_session_target(session), report=lambda done, text: reported.append((done, text)))
     count = len(SEQUENCE)
     assert reported == [(done, f"frame {done} of {count}") for done in (0, 10, count)]  # the segments' ends
 
@@ -103,7 +109,7 @@ def test_a_session_says_whether_it_is_simulated_or_nothing(recorded_frame: Path,
     session = Session.open(recorded_frame)
     session.metadata.pop("simulated", None)
     session.metadata.update({} if word is None else {"simulated": word})
-    seen = observe_session(session, session_target(session))
+    seen = observe_session(session, read_session_target(session))
     assert seen.sessions[0].simulated is simulated
     assert seen.simulated is bool(simulated)
 
@@ -113,21 +119,21 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
     shutil.copytree(recorded.path, damaged)
     session = Session.open(damaged)
     segment = session.frame_segments[0]
-    place = frame_places(segment)[2]
+    place = list_frame_places(segment)[2]
     data = bytearray(segment.read_bytes())
     data[place.chunk.offset + place.chunk.length // 2] ^= 0xFF
     segment.write_bytes(data)
-    when = re.escape(local_text(place.time_ns))
+    when = re.escape(format_local(place.time_ns))
     with pytest.raises(SessionError, match=rf"{segment.name}: .* {when}$"):
-        observe_session(session, session_target(session))
+        observe_session(session, read_session_target(session))
 
 
 def test_frames_of_a_capture_that_was_restarted_do_not_count(tmp_path: Path):
     after_ns = START_NS + 2 * 60 * NS_PER_S + 1
-    again = restarted(after_ns, "step-1", 1, "after a long interruption")
+    again = make_restart_event(after_ns, "step-1", 1, "after a long interruption")
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
     session = Session.open(tmp_path / "night")
-    seen = observe_session(session, session_target(session))
+    seen = observe_session(session, read_session_target(session))
     assert seen.reasons == ("", "its capture was restarted", "", "")
     assert np.isnan(seen.centres_px[1]).all()
 
@@ -135,27 +141,27 @@ def test_frames_of_a_capture_that_was_restarted_do_not_count(tmp_path: Path):
 def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):
     asyncio.run(record(tmp_path / "none", {}, frames=1))
     with pytest.raises(SessionError, match=r"no target\.yaml is attached"):
-        session_target(Session.open(tmp_path / "none"))
+        read_session_target(Session.open(tmp_path / "none"))
     asyncio.run(record(tmp_path / "wrong", {"target.yaml": "name: x\n"}, frames=1))
     with pytest.raises(ConfigError, match=r"target\.yaml: columns"):
-        session_target(Session.open(tmp_path / "wrong"))
+        read_session_target(Session.open(tmp_path / "wrong"))
 
 
 def test_a_session_that_never_shows_the_target_is_refused(tmp_path: Path):
     asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=3))
     session = Session.open(tmp_path / "night")
     with pytest.raises(SessionError, match="no frame can"):
-        observe_session(session, session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
+        observe_session(session, read_session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
 
 
 def test_sessions_are_put_end_to_end_with_references_of_their_own():
     first, moved = observations(quadratic), observations(quadratic, session=facts("night-2"))
     both = concatenate([first, replace(moved, centres_px=moved.centres_px + 5.0)])
     assert both.session.tolist() == [0] * 34 + [1] * 34
-    centres, variance = reference_centres(both)
+    centres, variance = average_reference_centres(both)
     np.testing.assert_allclose(centres[1] - centres[0], 5.0, rtol=0, atol=1e-9)
     np.testing.assert_allclose(variance, 1e-6 / 8)
-    rows = displacements(both, both.of(Role.VALIDATION))
+    rows = compute_displacements(both, both.of(Role.VALIDATION))
     count = len(rows.frame) // 2
     np.testing.assert_allclose(rows.displacement_px[:count], rows.displacement_px[count:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(rows.variance_px2, 1e-6 * (1 + 1 / 8))
@@ -179,7 +185,7 @@ def test_a_session_without_reference_frames_has_no_displacements():
     lonely = observations(quadratic)
     lonely = replace(lonely, role=np.where(lonely.role == "reference", "other", lonely.role))
     with pytest.raises(SessionError, match=r"night-1 .* reference frames"):
-        displacements(lonely, lonely.of(Role.FIT))
+        compute_displacements(lonely, lonely.of(Role.FIT))
 
 
 def test_missing_markers_are_left_out_one_by_one():
@@ -187,7 +193,7 @@ def test_missing_markers_are_left_out_one_by_one():
     centres = some.centres_px.copy()
     centres[9, 3] = np.nan  # in one frame
     centres[:8, 4] = np.nan  # never seen at the reference
-    rows = displacements(replace(some, centres_px=centres), some.of(Role.FIT))
+    rows = compute_displacements(replace(some, centres_px=centres), some.of(Role.FIT))
     assert len(rows.frame) == 14 * 53 - 1
     assert 4 not in rows.marker
 
@@ -316,12 +322,12 @@ def test_each_camera_of_a_session_is_observed_by_its_name(two_cameras: Path):
     assert (side.camera_degC - leading.camera_degC).tolist() == pytest.approx([WARMER_K] * FRAMES)
     assert [each.sessions[0].camera_serial for each in (leading, side)] == ["TS-0001", "TS-0002"]
     session = Session.open(path)
-    take(session, "side")
-    assert recorded_history(session).camera_degC[0] == pytest.approx(leading.camera_degC[0] + WARMER_K, abs=0.5)
+    select_camera(session, "side")
+    assert read_history(session).camera_degC[0] == pytest.approx(leading.camera_degC[0] + WARMER_K, abs=0.5)
     with pytest.raises(SessionError, match=r"camera top; .* camera, side"):
         observe(path, camera="top")
-    assert own_frames(session) == [1, 3, 5]
-    assert (name_of(session, "TS-0002"), name_of(session, "TS-0009")) == ("side", None)
+    assert list_camera_frames(session) == [1, 3, 5]
+    assert (find_camera_name(session, "TS-0002"), find_camera_name(session, "TS-0009")) == ("side", None)
     for command in (["apply", str(model_of(path.parent, "TS-0009"))], ["budget"], ["calibrate"]):
         out = [] if command == ["budget"] else ["-o", str(path.parent / "out")]
         result = CliRunner().invoke(app, [*command, str(path), "--camera", "top", *out])
@@ -329,7 +335,7 @@ def test_each_camera_of_a_session_is_observed_by_its_name(two_cameras: Path):
 
 
 def model_of(folder: Path, serial: str) -> Path:
-    count = len(exponents(1))
+    count = len(list_exponents(1))
     facts = ModelFacts(
         image_size=(640, 480),
         hull_px=np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]]),

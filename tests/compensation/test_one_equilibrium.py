@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from tests.recording.recorded import START_NS, frame, record
+from tests.recording.full_session import START_NS, frame, record
 from thermostand.compensation.cli import app
 from thermostand.compensation.observations import check_one_equilibrium
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, StepMark, StepState
-from thermostand.recording.format.restarts import restarted
+from thermostand.recording.format.capture_restarts import make_restart_event
 from thermostand.recording.reading.session import Session
 
 
@@ -25,7 +25,9 @@ def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):
         yield frame(time_ns - 50_000_000, index)
         if index == 11:
             if superseded:
-                yield from (restarted(time_ns - NS_PER_S // 4, f"capture-{each}", 1, "x") for each in range(gap_index))
+                yield from (
+                    make_restart_event(time_ns - NS_PER_S // 4, f"capture-{each}", 1, "x") for each in range(gap_index)
+                )
             data = {"before_K": 15.2, "after_K": 13.1, "gap_ns": START_NS + gap_index * NS_PER_S // 2 - NS_PER_S // 4}
             yield Event(time_ns, "warning", "camera_offset_changed", "text is for people", data)
 

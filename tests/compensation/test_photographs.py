@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.compensation.cli import app
 from thermostand.compensation.commands import detect_cli
 from thermostand.markers.detection import Detection, detect
-from thermostand.markers.grid import project
+from thermostand.markers.grid_identification import project
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import load_target
 
@@ -61,14 +61,14 @@ def detected(numbers: tuple[int, ...], out: Path) -> Detected:
     return out, detections
 
 
-@pytest.mark.parametrize(("numbers", "doubtless"), [(BY_DAY, 0), by_night(OTHERS, 1)])
+@pytest.mark.parametrize(("numbers", "doubtless"), [(BY_DAY, 0), mark_nightly(OTHERS, 1)])
 def test_noise_does_not_describe_webcam_pictures_of_a_print_and_that_is_said(
     numbers: tuple[int, ...], doubtless: int, detected_of: Callable[[tuple[int, ...]], Detected]
 ):
     assert [one.is_doubtful for one in detected_of(numbers)[1]].count(False) <= doubtless
 
 
-@pytest.fixture(params=[*BY_DAY, *map(by_night, OTHERS)], ids="{}.png".format)
+@pytest.fixture(params=[*BY_DAY, *map(mark_nightly, OTHERS)], ids="{}.png".format)
 def photograph(
     request: pytest.FixtureRequest, detected_of: Callable[[tuple[int, ...]], Detected]
 ) -> tuple[np.ndarray, Detection]:
@@ -77,7 +77,7 @@ def photograph(
     return read_image(IMAGES / f"{request.param}.png"), detection
 
 
-@pytest.mark.parametrize("numbers", [BY_DAY, by_night(OTHERS)])
+@pytest.mark.parametrize("numbers", [BY_DAY, mark_nightly(OTHERS)])
 def test_the_table_has_every_marker_of_every_photograph(
     numbers: tuple[int, ...], detected_of: Callable[[tuple[int, ...]], Detected]
 ):

@@ -19,9 +19,9 @@ import pytest
 
 import thermostand
 from thermostand import compensation, markers, recording
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.expression import POWER, lag
-from thermostand.compensation.history.thermal_history import ThermalHistory, ThermalMemory, states_at
+from thermostand.compensation.history.thermal_history import ThermalHistory, ThermalStateSpec, compute_states_at
 from thermostand.experiments.steps import Role
 
 from .conftest import Recorded
@@ -199,9 +199,9 @@ def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings(
     known: dict[str, Any] = {"air": air}
     told: dict[str, Any] = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
     slow = [lag(POWER, 1620.0)]
-    memory = ThermalMemory(tuple(slow))
+    memory = ThermalStateSpec(tuple(slow))
     history = ThermalHistory(*air, air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
-    truth = states_at(history, memory, air_ns[frames], own_degC[frames])
+    truth = compute_states_at(history, memory, air_ns[frames], own_degC[frames])
     model: Any = SimpleNamespace(memory=memory)
     found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **told)
     np.testing.assert_allclose(found.of(slow), truth.of(slow))
@@ -209,7 +209,7 @@ def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings(
     assert np.abs(blind.of(slow) - truth.of(slow)).max() > 0.1
     centres_px = np.tile([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0], [9.0, 9.0]], (4, 1, 1))
     seen = thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], **told)
-    np.testing.assert_allclose(frame_states(seen, memory).of(slow), truth.of(slow))
+    np.testing.assert_allclose(compute_frame_states(seen, memory).of(slow), truth.of(slow))
     with pytest.raises(ValueError, match="only together with air"):
         thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], supply=told["supply"])
     with pytest.raises(ValueError, match="time_ns go backwards"):

@@ -18,22 +18,39 @@ from thermostand.compensation.budget.budget import Budget, BudgetLine
 from thermostand.compensation.budget.geometry import ThermometerState
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
-from thermostand.compensation.drift.terms import features
+from thermostand.compensation.drift.terms import compute_features
 from thermostand.compensation.history.thermal_history import States, ThermalHistory
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.compensation.reporting.drawing import report_figures
-from thermostand.compensation.reporting.drawing.figures import Paths, as_svg, enlarged, trajectories
-from thermostand.compensation.reporting.drawing.report_figures import measured_against_model
-from thermostand.compensation.reporting.equipment import equipment_of
-from thermostand.compensation.reporting.numbers import Extras, Numbers, as_json, formula_of, numbers_of
+from thermostand.compensation.reporting.drawing.figures import (
+    PathPanel,
+    choose_enlargement,
+    draw_trajectories,
+    render_svg,
+)
+from thermostand.compensation.reporting.drawing.report_figures import draw_measured_against_model
+from thermostand.compensation.reporting.equipment import list_equipment
 from thermostand.compensation.reporting.report import (
     can_be_fitted,
     check_report_writable,
-    page_of,
-    report_page,
+    render_numbers,
+    render_report,
     write_report,
 )
-from thermostand.compensation.reporting.tracks import cycle, moved_px, thinned, visits, warm_ups
+from thermostand.compensation.reporting.report_numbers import (
+    Extras,
+    ReportNumbers,
+    collect_numbers,
+    describe_formula,
+    serialise_numbers,
+)
+from thermostand.compensation.reporting.tracks import (
+    compute_displacement_px,
+    find_cycle,
+    find_warm_ups,
+    list_visits,
+    thin,
+)
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event
@@ -91,8 +108,8 @@ def page(written: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def numbers(analysed: Analysed) -> Numbers:
-    return numbers_of(*analysed)
+def numbers(analysed: Analysed) -> ReportNumbers:
+    return collect_numbers(*analysed)
 
 
 def warm_up_only(frames: int = 12, roles: tuple[str, ...] = ("warm_up",)) -> Observations:
@@ -190,22 +207,22 @@ def test_page_and_file_have_the_numbers_of_the_evaluation(page: str, written: Pa
     ]
 
 
-def test_the_uncertainty_is_what_noise_and_model_make(numbers: Numbers):
+def test_the_uncertainty_is_what_noise_and_model_make(numbers: ReportNumbers):
     score = numbers.score
     assert score is not None
     np.testing.assert_allclose(score.marker_sigma_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=1e-6)
     assert (np.array(score.claimed_sigma_px) >= score.marker_sigma_px).all()
-    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in page_of(numbers)
+    assert f"<td>{1e3 * score.claimed_sigma_px[0]:.2f}</td>" in render_numbers(numbers)
 
 
-def test_an_interval_that_claims_too_much_is_reported(numbers: Numbers):
+def test_an_interval_that_claims_too_much_is_reported(numbers: ReportNumbers):
     assert numbers.score is not None
     too_few = replace(numbers, score=replace(numbers.score, coverage_95=(0.96, 0.34)))
-    assert "thermal lag, hysteresis" not in page_of(numbers)
-    assert "thermal lag, hysteresis" in page_of(too_few)
+    assert "thermal lag, hysteresis" not in render_numbers(numbers)
+    assert "thermal lag, hysteresis" in render_numbers(too_few)
 
 
-def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers):
+def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: ReportNumbers):
     assert numbers.model is not None
     one = replace(numbers.model, between_nights_px=(0.004, 0.009))
     two = replace(one, session_ids=("night-1", "night-2"), nights_compared=2)
@@ -214,7 +231,7 @@ def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: Numbers
         (two, "", "fitted, of 2 compared"),
         (numbers.model, "is not known", ""),  # of the paper's form
     ):
-        page = page_of(replace(numbers, model=model))
+        page = render_numbers(replace(numbers, model=model))
         assert (f"How well nights repeat {said}" in page) == bool(said)
         assert ("How well nights repeat" in page) == bool(said)
         assert ("added by a night" in page) == bool(row)
@@ -244,7 +261,7 @@ def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
 def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving_out():
     night = observations(quadratic, 0.005, held_out_degC=())
     model = fit_paper(night, 2)
-    text = report_page(night, model, evaluate(model, night))
+    text = render_report(night, model, evaluate(model, night))
     assert headings(text) == [
         name for name in HEADINGS if name not in ("Warm-up", "The stand's budget", "Frames left out")
     ]
@@ -253,7 +270,7 @@ def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving
 
 @pytest.mark.parametrize("role", ["calibration", "pose"])
 def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
-    text = report_page(warm_up_only(roles=(role,)), None, None)
+    text = render_report(warm_up_only(roles=(role,)), None, None)
     assert headings(text) == ["Result", "Recorded data", "Measured with"]
     assert f"({12 + 8} {role})" in text
 
@@ -262,14 +279,14 @@ def test_a_session_without_any_drift_is_reported_all_the_same(role: str):
 @pytest.mark.parametrize("role", ["fit", "other"])
 def test_frames_of_ones_own_steps_without_a_reference_are_shown_over_time(role: str):
     own = warm_up_only(roles=(role,))
-    text = report_page(own, None, None)
+    text = render_report(own, None, None)
     assert not can_be_fitted(own)
     assert headings(text) == ["Result", "Drift over time", "Recorded data", "Measured with"]
     assert f"({12 + 8} {role})" in text
 
 
 def test_a_long_warm_up_does_not_make_a_large_page():
-    text = report_page(warm_up_only(3600), None, None)
+    text = render_report(warm_up_only(3600), None, None)
     assert len(text.encode()) < 1_000_000
     assert "only so many" in text
 
@@ -281,11 +298,11 @@ def test_what_a_session_says_of_itself_cannot_change_the_page():
     reasons = ("",) * (len(cold.role) - 1) + (evil,)
     target = cold.target.model_copy(update={"name": evil})
     own = replace(cold, sessions=(named,), reasons=reasons, target=target)
-    text = report_page(own, None, None)
+    text = render_report(own, None, None)
     assert "<script" not in text
     assert '<b id="x' not in text
     assert text.count("&lt;script&gt;") >= 6
-    assert json.loads(as_json(numbers_of(own, None, None)))["sessions"][0]["operator"] == evil
+    assert json.loads(serialise_numbers(collect_numbers(own, None, None)))["sessions"][0]["operator"] == evil
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -302,20 +319,20 @@ def test_its_numbers_do_not_take_the_place_of_another_file(tmp_path: Path):
             check_report_writable(tmp_path / page_path, model)
 
 
-def test_what_the_model_leaves_of_a_warm_up_is_reported(numbers: Numbers, page: str, analysed: Analysed):
+def test_what_the_model_leaves_of_a_warm_up_is_reported(numbers: ReportNumbers, page: str, analysed: Analysed):
     night, model, _ = analysed
     (warm_up,) = numbers.warm_ups  # four of the frames at the reference: nothing is left but noise
     np.testing.assert_allclose(warm_up.left_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=0.15)
     assert "".join(f"<td>{1e3 * value:.1f}</td>" for value in warm_up.left_px) in page
     moved = np.where((night.role == "warm_up")[:, None, None], night.centres_px + 400, night.centres_px)
-    (elsewhere,) = numbers_of(replace(night, centres_px=moved), model, None).warm_ups
+    (elsewhere,) = collect_numbers(replace(night, centres_px=moved), model, None).warm_ups
     assert np.isnan(elsewhere.left_px).all()
 
 
 def test_the_formula_in_the_report_gives_the_model_s_corrections(analysed: Analysed):
     """The printed coefficients, put into the printed formula, are the model."""
     night, model, _ = analysed
-    formula = numbers_of(*analysed).model.formula
+    formula = collect_numbers(*analysed).model.formula
     points, degC = places_px()[:5], 41.5
     width, height = night.image_size
     low, high = model.facts.camera_range_degC
@@ -333,10 +350,10 @@ def test_the_formula_in_the_report_gives_the_model_s_corrections(analysed: Analy
 
 def test_the_formula_of_the_thermal_form_is_its_homography():
     model = thermal()
-    formula = formula_of(model)
+    formula = describe_formula(model)
     states = States(model.memory, np.full((1, len(model.memory.at) + 2), 30.0))
     amounts = (
-        features(states, [term.feature for term in model.terms], model.origin) - np.array(formula.reference)
+        compute_features(states, [term.feature for term in model.terms], model.origin) - np.array(formula.reference)
     ) @ formula.coefficients_px
     a = amounts[0]
     place = np.array([[200.0, 100.0]])
@@ -353,7 +370,7 @@ def test_the_formula_of_the_thermal_form_is_its_homography():
 def test_figures_are_numbered_and_those_with_a_line_of_equality_have_equal_axes(analysed: Analysed, page: str):
     numbered = re.findall(r"<b>Figure (\d+)\.</b>", page)
     assert numbered == [str(number) for number in range(1, len(numbered) + 1)]
-    for axes in measured_against_model(analysed[2]).axes:
+    for axes in draw_measured_against_model(analysed[2]).axes:
         assert axes.get_aspect() == 1
 
 
@@ -369,18 +386,18 @@ def test_what_turns_light_on_dark_screens_is_drawn_as_the_rules_expect(page: str
 
 
 def test_the_residuals_have_a_scale_of_their_own():
-    scale, bar_px = enlarged(0.005, 2448)
+    scale, bar_px = choose_enlargement(0.005, 2448)
     assert (scale, bar_px) == (20_000, 0.01)
     assert 0.5 < scale * 0.005 / (0.06 * 2448) <= 1
 
 
-def test_doubtful_frames_are_named_when_they_are_more_than_noise_alone_gives(numbers: Numbers):
+def test_doubtful_frames_are_named_when_they_are_more_than_noise_alone_gives(numbers: ReportNumbers):
     """1 of 200 frames of noise alone is doubtful."""
 
     def says_doubtful(frames: int, doubtful: int) -> bool:
         (session, *_) = numbers.sessions
         own = replace(numbers, sessions=(replace(session, frames=frames, doubtful=doubtful),), unusable=())
-        return "frames are not described by" in page_of(own)
+        return "frames are not described by" in render_numbers(own)
 
     assert [says_doubtful(*case) for case in ((60, 1), (60, 2), (1000, 20), (1000, 21))] == [False, True, False, True]
 
@@ -406,7 +423,7 @@ def test_a_sensor_stands_with_its_certificate_and_uncertainty(sensor: str, text:
     session: Any = SimpleNamespace(
         frame_metas=list[Any], camera="camera", events=list[Any], attachment={"config.yaml": config}.get
     )
-    assert ("Thermometer channels", f"{text}, laboratory") in equipment_of(session)
+    assert ("Thermometer channels", f"{text}, laboratory") in list_equipment(session)
 
 
 def test_devices_stand_with_what_they_said_of_themselves_and_other_cameras_do_not() -> None:
@@ -420,7 +437,7 @@ def test_devices_stand_with_what_they_said_of_themselves_and_other_cameras_do_no
         identity("relays", "Waveshare", "Relay (16)", ""),
     ]
     session: Any = SimpleNamespace(frame_metas=list[Any], camera="camera", events=lambda: events, attachment={}.get)
-    assert [found for _, found in equipment_of(session)] == [
+    assert [found for _, found in list_equipment(session)] == [
         "Basler a2A, serial number 40001, version 1",
         "25 mm",
         "Waveshare Relay (16), version 1",
@@ -469,7 +486,7 @@ def test_the_drift_is_measured_from_the_reference_or_else_from_the_first_frame()
     night = observations(quadratic)
     cold = observations(quadratic, fit_degC=(10.0, 24.0), held_out_degC=(), session=facts("cold"))
     cold = replace(cold, role=np.array(["warm_up"] * 12))
-    moved = moved_px(concatenate([night, cold]))
+    moved = compute_displacement_px(concatenate([night, cold]))
     np.testing.assert_allclose(moved[:8], 0, rtol=0, atol=1e-9)
     assert np.abs(moved[-1]).max() < 1e-9  # 24 degC, as in its first frame
     expected = quadratic(night.centres_px[0], -14.0) - night.centres_px[0]
@@ -482,56 +499,56 @@ def test_a_target_that_was_moved_on_purpose_is_no_drift(role: Role):
     centres, roles = night.centres_px.copy(), night.role.astype("U16")
     centres[10:13] += 28.0
     roles[10:13] = str(role)
-    moved = moved_px(replace(night, centres_px=centres, role=roles))
+    moved = compute_displacement_px(replace(night, centres_px=centres, role=roles))
     assert np.isnan(moved[10:13]).all()
     assert np.nanmax(np.abs(moved)) < 2
 
 
 def test_a_warm_up_of_a_rolled_camera_is_measured_from_its_own_first_frame():
     both = concatenate([warm_up("upright"), warm_up("rolled", 20.0)])
-    normal, rolled = warm_ups(both)
+    normal, rolled = find_warm_ups(both)
     assert normal.track.roll_deg == pytest.approx(0, abs=1e-6)
     assert rolled.track.roll_deg == pytest.approx(20, abs=1e-3)
     for one in (normal, rolled):
         np.testing.assert_allclose(one.track.mean_px[0], 0, atol=1e-9)
         np.testing.assert_allclose(one.track.mean_px[-1], [0.12, 0.36], atol=1e-9)
-    assert np.nanmax(np.abs(moved_px(both))) < 1
+    assert np.nanmax(np.abs(compute_displacement_px(both))) < 1
 
 
 def test_a_warm_up_rolled_before_the_reference_of_its_session_does_not_jump():
     night, rolled = observations(quadratic), warm_up("x", 20.0)
     roles = np.concatenate([np.array(["warm_up"] * 4), night.role[4:]])
     centres = np.concatenate([rolled.centres_px[:4], night.centres_px[4:]])
-    assert np.nanmax(np.abs(moved_px(replace(night, role=roles, centres_px=centres)))) < 2
+    assert np.nanmax(np.abs(compute_displacement_px(replace(night, role=roles, centres_px=centres)))) < 2
 
 
 def test_a_warm_up_is_timed_from_when_the_camera_was_switched_on():
     cold = warm_up("cold")
     first = int(cold.time_ns[0])
     for on_ns, expected_s in (([first - 4_000_000_000], 4.0), ([first - 90_000_000_000, first - 3_000_000_000], 3.0)):
-        (found,) = warm_ups(replace(cold, histories=(powered(on_ns),)))
+        (found,) = find_warm_ups(replace(cold, histories=(powered(on_ns),)))
         assert found.power_on_known
         assert found.since_on_s[:2] == pytest.approx([expected_s, expected_s + 0.5])
     for histories in ((), (powered([]),), (powered([first + 1]),)):
-        (found,) = warm_ups(replace(cold, histories=histories))
+        (found,) = find_warm_ups(replace(cold, histories=histories))
         assert not found.power_on_known
         assert found.since_on_s[0] == 0
 
 
 def test_visits_know_from_which_side_they_were_reached():
     night = observations(quadratic, fit_degC=(31.0, 38.0, 31.0, 10.0), held_out_degC=())
-    track = cycle(night, 0)
+    track = find_cycle(night, 0)
     assert track is not None
-    found = visits(night, track)
+    found = list_visits(night, track)
     assert [(one.chamber_degC, one.direction) for one in found] == [(24, 0), (31, 1), (38, 1), (31, -1), (10, -1)]
     expected = (quadratic(places_px(), 14.0) - places_px()).mean(axis=0)
     np.testing.assert_allclose(found[2].mean_px, expected, atol=1e-9)
-    assert cycle(warm_up("cold"), 0) is None
+    assert find_cycle(warm_up("cold"), 0) is None
 
 
 def test_thinning_keeps_the_ends():
-    assert thinned(5, 10).tolist() == [0, 1, 2, 3, 4]
-    assert thinned(3600, 4).tolist() == [0, 1200, 2399, 3599]
+    assert thin(5, 10).tolist() == [0, 1, 2, 3, 4]
+    assert thin(3600, 4).tolist() == [0, 1200, 2399, 3599]
 
 
 def test_figures_bear_missing_frames_and_temperatures():
@@ -541,12 +558,12 @@ def test_figures_bear_missing_frames_and_temperatures():
     centres[:, 5] = np.nan
     air[:] = np.nan
     holes = replace(night, centres_px=centres, air_degC=air)
-    assert np.isnan(moved_px(holes)[3]).all()
-    track = cycle(holes, 0)
+    assert np.isnan(compute_displacement_px(holes)[3]).all()
+    track = find_cycle(holes, 0)
     assert track is not None
-    paths = Paths("", track.start_px, track.moved_px, holes.camera_degC[track.frames])
-    for figure in (trajectories(holes, [paths]), report_figures.against_time(holes)):
-        assert as_svg(figure, "holes").startswith("<svg")
+    paths = PathPanel("", track.start_px, track.moved_px, holes.camera_degC[track.frames])
+    for figure in (draw_trajectories(holes, [paths]), report_figures.draw_against_time(holes)):
+        assert render_svg(figure, "holes").startswith("<svg")
 
 
 def test_what_a_thermal_imager_saw_stands_beneath_the_drift():
@@ -554,8 +571,8 @@ def test_what_a_thermal_imager_saw_stands_beneath_the_drift():
     times_ns = np.linspace(night.time_ns[0] - 10**12, night.time_ns[-1] + 10**12, 1000).astype(np.int64)
     spots = {"lens": (times_ns, np.linspace(30.0, 50.0, 1000)), "back": (times_ns, np.full(1000, np.nan))}
     without, seen = night, replace(night, sessions=(replace(facts(), spots=spots),))
-    assert len(report_figures.against_time(without).axes) == 2
-    *_, foot = report_figures.against_time(seen).axes
+    assert len(report_figures.draw_against_time(without).axes) == 2
+    *_, foot = report_figures.draw_against_time(seen).axes
     lens, _ = foot.lines
     hours = (night.time_ns[-1] - night.time_ns[0]) / 3.6e12
     shown = np.asarray(lens.get_xdata(), np.float64)

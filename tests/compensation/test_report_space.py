@@ -10,9 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.reporting.numbers import Extras, TablePositions, numbers_of, table_positions
-from thermostand.compensation.reporting.report import report_page
-from thermostand.compensation.validation3d.document import as_json, load_validation
+from thermostand.compensation.reporting.report import render_report
+from thermostand.compensation.reporting.report_numbers import (
+    Extras,
+    TablePositions,
+    collect_numbers,
+    list_table_positions,
+)
+from thermostand.compensation.validation3d.document import load_validation, serialise_validation
 from thermostand.compensation.validation3d.validate import Deviations, SpatialValidation
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark, StepState
@@ -67,7 +72,7 @@ def validation() -> SpatialValidation:
 
 def written(validation: SpatialValidation, folder: Path) -> Path:
     path = folder / "validation.json"
-    path.write_text(as_json(validation))
+    path.write_text(serialise_validation(validation))
     return path
 
 
@@ -90,7 +95,7 @@ def test_a_validation_is_read_back_as_it_was_written(validation: SpatialValidati
     )
     for one in (validation, alone):
         found = load_validation(written(one, tmp_path))
-        assert as_json(found) == as_json(one)
+        assert serialise_validation(found) == serialise_validation(one)
         np.testing.assert_array_equal(found.after.u_um, one.after.u_um)
         np.testing.assert_array_equal(found.flags, one.flags)
 
@@ -125,7 +130,7 @@ def test_no_file_and_no_json_are_refused_with_a_sentence(tmp_path: Path):
 def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validation: SpatialValidation):
     night = observations(quadratic, 0.005)
     extras = Extras(positions=TablePositions(((0.0, 0.0), (90.0, 15.0)), PLACES), validation=validation)
-    page = report_page(night, None, None, extras)
+    page = render_report(night, None, None, extras)
     before, after = validation.before.mean_um, validation.after.mean_um
     assert page.count("<td>142.0</td><td>28.7</td><td>80 %</td>") == 2  # first of all, and in its section
     assert page.count(f"<td>{before[2]:.1f}</td><td>{after[2]:.2f}</td>") == 2
@@ -134,7 +139,7 @@ def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validat
     assert "<td>0.0298</td><td>0.2126</td><td>0.2326</td>" in page  # the paper's Table 1
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
-    numbers = numbers_of(night, None, None, extras)
+    numbers = collect_numbers(night, None, None, extras)
     assert isinstance(numbers.validation, dict)
     assert numbers.validation["results"][1]["mean_um"] == after.tolist()
     assert numbers.positions.poses == PLACES
@@ -143,8 +148,8 @@ def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validat
 def test_a_target_that_never_moved_has_no_such_section():
     night = observations(quadratic, 0.005)
     night = replace(night, role=np.full(len(night.role), "calibration"))
-    assert "In three dimensions" not in report_page(night, None, None)
-    drawn = report_page(night, None, None, Extras(positions=TablePositions(poses=PLACES)))
+    assert "In three dimensions" not in render_report(night, None, None)
+    drawn = render_report(night, None, None, Extras(positions=TablePositions(poses=PLACES)))
     assert drawn.count("<svg") == 1
     assert "In three dimensions" in drawn
     assert "Table 1" not in drawn
@@ -153,7 +158,7 @@ def test_a_target_that_never_moved_has_no_such_section():
 def test_positions_are_those_of_the_recorded_moves_each_once():
     grid = ((0.0, -15.0), (0.0, 15.0))
     first = steps(grid, "calibration", "a") + steps((*PLACES, PLACES[0]), "pose", "b")
-    found = table_positions([first, steps((*PLACES, (10.0, -20.0)), "pose", "c")])
+    found = list_table_positions([first, steps((*PLACES, (10.0, -20.0)), "pose", "c")])
     assert found.calibration == grid
     assert found.poses == (*PLACES, (10.0, -20.0))
-    assert table_positions([steps(PLACES, "fit", "d")]) == TablePositions()
+    assert list_table_positions([steps(PLACES, "fit", "d")]) == TablePositions()

@@ -19,7 +19,7 @@ from thermostand.compensation.calibration.session_centres import Views
 from thermostand.compensation.cli import app
 from thermostand.foundation.errors import CalibrationError
 
-from .rendered import Scene, photograph, render
+from .renderer import Scene, photograph, render
 
 Float = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def drawn(seed: int, cameras: int, moments: int = 9) -> tuple[list[Views], Board
 
 def errors_in_sigmas(found: RigCalibration, camera: int) -> Float:
     """Turn and shift (6,) off the truth, in their standard uncertainties."""
-    turn_deg, shift_mm = found.pose_sigma(camera)
+    turn_deg, shift_mm = found.compute_pose_sigma(camera)
     turned = Rotation.from_matrix(found.scene.rotations[camera] @ TURNS[camera].T).as_rotvec(degrees=True)
     return np.concatenate([turned / turn_deg, (found.scene.translations_mm[camera] - SHIFTS_mm[camera]) / shift_mm])
 
@@ -70,7 +70,7 @@ def test_two_and_three_cameras_are_found_within_their_claimed_uncertainty():
     off = np.concatenate([*(errors_in_sigmas(one, 1) for one in pairs), *(errors_in_sigmas(three, n) for n in (1, 2))])
     assert 0.4 < np.mean(off**2) < 1.9
     assert np.abs(off).max() < 4
-    assert max(pairs[0].pose_sigma(1)[1]) < 0.5
+    assert max(pairs[0].compute_pose_sigma(1)[1]) < 0.5
     assert all(one.rms_px(0) == pytest.approx(NOISE_px, rel=0.15) for one in pairs)
     assert not pairs[0].discrepancies_px.any()
 

@@ -16,7 +16,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from thermostand.compensation.apply.runtime_export import export_ros2, runtime_model
+from thermostand.compensation.apply.runtime_export import build_runtime_model, export_ros2
 from thermostand.compensation.drift_runtime import Drift
 
 from .made_up_models import thermal
@@ -61,7 +61,7 @@ def live(node: StubNode, drift: Drift, seconds: float, count: int, air_degC: flo
 
 
 def begun(node: StubNode) -> tuple[Drift, float]:
-    drift = Drift(dict(runtime_model(thermal())))
+    drift = Drift(dict(build_runtime_model(thermal())))
     node.send("camera_temperature", temperature(99.5, 44.0))
     node.send("air_temperature", temperature(100.0, 24.0))
     drift.advance(0.0, 24.0, 1.0, 44.0)

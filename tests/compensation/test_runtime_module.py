@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.apply.runtime_export import export, runtime_model
+from thermostand.compensation.apply.runtime_export import build_runtime_model, export_runtime
 from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.model_file import load_model, save_model
 from thermostand.compensation.drift_runtime import Drift
-from thermostand.compensation.history.thermal_history import States, row_of, state_of
+from thermostand.compensation.history.thermal_history import States, make_initial_state, read_state_row
 from thermostand.foundation.errors import SessionError
 
 from .made_up_models import LIFE, MODELS, POINTS, paper, thermal
@@ -22,8 +22,8 @@ from .made_up_models import LIFE, MODELS, POINTS, paper, thermal
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(model: DriftModel, tmp_path: Path):
-    export(model, tmp_path / "new")
-    live, state = Drift.load(tmp_path / "new" / "drift.json"), state_of(model.memory)
+    export_runtime(model, tmp_path / "new")
+    live, state = Drift.load(tmp_path / "new" / "drift.json"), make_initial_state(model.memory)
     assert np.isnan(live.correct(POINTS)).all()
     seen = set()
     for number, sample in enumerate(LIFE):
@@ -32,7 +32,7 @@ def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(mod
         if number % 7 and not np.isnan(sample).any():
             continue
         states = (
-            States(model.memory, row_of(state)[None])
+            States(model.memory, read_state_row(state)[None])
             if model.form == "thermal"
             else States.at_degC(live._camera_degC, 1)
         )
@@ -52,7 +52,7 @@ def test_the_module_gives_the_model_s_corrections_and_flags_at_every_instant(mod
 
 
 def test_the_module_needs_numpy_only_and_runs_where_nothing_else_is(tmp_path: Path):
-    _, module = export(thermal(), tmp_path)
+    _, module = export_runtime(thermal(), tmp_path)
     tree = ast.parse(module.read_text())
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     assert imported == {"json", "math", "numpy"}
@@ -63,24 +63,24 @@ def test_the_module_needs_numpy_only_and_runs_where_nothing_else_is(tmp_path: Pa
         "assert not {'compensation', 'stand', 'scipy', 'cv2'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-I", "-c", program], cwd=tmp_path, capture_output=True, check=True)
-    state = state_of(thermal().memory)
+    state = make_initial_state(thermal().memory)
     for _ in range(2000):
         state.advance(10, 24.0, 1, 44.0)
-    states = States(thermal().memory, row_of(state)[None])
+    states = States(thermal().memory, read_state_row(state)[None])
     expected = thermal().correct(np.array([[320.5, 200.25]]), states)
     np.testing.assert_allclose(json.loads(done.stdout), expected, atol=1e-9)
 
 
 def test_the_exported_file_is_small():
-    assert len(json.dumps(runtime_model(thermal()))) < 5000
-    assert len(json.dumps(runtime_model(paper(4)))) < 5000
+    assert len(json.dumps(build_runtime_model(thermal()))) < 5000
+    assert len(json.dumps(build_runtime_model(paper(4)))) < 5000
 
 
 def test_a_file_that_is_no_runtime_model_is_refused():
     with pytest.raises(ValueError, match="drift runtime model"):
         Drift({"format": "thermostand drift model"})
     with pytest.raises(ValueError, match="of this version"):
-        Drift(runtime_model(thermal()) | {"version": 3})
+        Drift(build_runtime_model(thermal()) | {"version": 3})
 
 
 def test_a_model_file_holds_both_forms_and_one_of_a_single_form_still_opens(tmp_path: Path):

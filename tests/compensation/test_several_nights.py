@@ -7,29 +7,29 @@ from functools import cache
 
 import numpy as np
 
-from thermostand.compensation.drift.thermal_learning import fit_thermal
+from thermostand.compensation.drift.thermal_fit import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.observations import concatenate
 
-from .drawn_cameras import drawn_camera
-from .drawn_nights import Night, full_night, night
+from .drawn_cameras import draw_camera
+from .drawn_sessions import DrawnSession, make_full_session, record_session
 
 SEED = 2700
 
 
 @cache
-def made(number: int) -> Night:
+def made(number: int) -> DrawnSession:
     """The image of each night is larger by a part that no temperature explains, along J and towards the edges of the
     cycle: 0.5 mpx/K of the set-point in every other night. The same for all tests, who read it only."""
-    one = night(drawn_camera(SEED), full_night(), 10 * SEED + number, session_id=f"night-{number}")
+    one = record_session(draw_camera(SEED), make_full_session(), 10 * SEED + number, session_id=f"night-{number}")
     away_K = one.observed.chamber_degC - 24.0
     shift = (0.0005 if number % 2 else -0.0005) * away_K[:, None, None] * np.array([0.0, 1.0])
-    return Night(replace(one.observed, centres_px=one.observed.centres_px + shift), one.truth_px + shift)
+    return DrawnSession(replace(one.observed, centres_px=one.observed.centres_px + shift), one.truth_px + shift)
 
 
 @cache
-def thermal(*nights: Night) -> ThermalModel:
+def thermal(*nights: DrawnSession) -> ThermalModel:
     return fit_thermal(concatenate([one.observed for one in nights]))
 
 
@@ -46,7 +46,7 @@ def test_what_does_not_repeat_between_nights_is_claimed() -> None:
 def test_it_is_added_on_another_night_only() -> None:
     first, other = (made(number) for number in range(2))
     model = thermal(first)
-    places, state = first.truth_px[0], frame_states(first.observed, model.memory).where(np.array([0]))
+    places, state = first.truth_px[0], compute_frame_states(first.observed, model.memory).where(np.array([0]))
     own, any_night = model.of_sessions(["night-0"]), model.of_sessions(["night-0", "night-1"])
     assert model.between_nights is not None
     more = any_night.covariance(places, state) - own.covariance(places, state)
@@ -58,7 +58,7 @@ def test_a_night_that_the_others_cannot_do_without_says_nothing() -> None:
     whole, few = made(0), made(1)
     far = np.abs(few.observed.chamber_degC - 24.0) > 8
     reasons = tuple("not of this night" if out else why for out, why in zip(far, few.observed.reasons, strict=True))
-    short = Night(replace(few.observed, reasons=reasons), few.truth_px)
+    short = DrawnSession(replace(few.observed, reasons=reasons), few.truth_px)
     found = thermal(whole, short).between_nights
     assert found is not None
     assert found.nights == 1

@@ -9,17 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.choosing import better, fit
 from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.evaluation import evaluate
-from thermostand.compensation.drift.facts import ModelFacts
+from thermostand.compensation.drift.model_facts import ModelFacts
 from thermostand.compensation.drift.model_file import load_model, save_model
+from thermostand.compensation.drift.model_selection import fit, select_better
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
-from thermostand.compensation.drift.terms import OfPlay
-from thermostand.compensation.drift.thermal_learning import fit_thermal
-from thermostand.compensation.drift.thermal_model import ThermalModel, between_nights
-from thermostand.compensation.drift.training import frame_states
-from thermostand.compensation.history.thermal_history import States, row_of, state_of, states_at
+from thermostand.compensation.drift.terms import BacklashTerm
+from thermostand.compensation.drift.thermal_fit import fit_thermal
+from thermostand.compensation.drift.thermal_model import ThermalModel, estimate_between_sessions
+from thermostand.compensation.drift.training_data import compute_frame_states
+from thermostand.compensation.history.thermal_history import (
+    States,
+    compute_states_at,
+    make_initial_state,
+    read_state_row,
+)
 from thermostand.compensation.observations import Observations, concatenate
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import ConfigError, SessionError
@@ -46,7 +51,7 @@ def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: np.ndarray
     """RMS of both coordinates against the noise-free truth, pooled."""
     observed, truth = seen
     at_reference = truth[observed.of(Role.REFERENCE)].mean(axis=0) if reference_px is None else reference_px
-    states = frame_states(observed, model.memory)
+    states = compute_frame_states(observed, model.memory)
     frames = np.flatnonzero(observed.of(role))
     left = [at_reference - model.correct(truth[frame], states.where(np.array([frame]))) for frame in frames]
     return 1e3 * float(np.sqrt(np.mean(np.square(left))))
@@ -82,9 +87,9 @@ def test_forms_that_are_as_good_at_rest_are_chosen_by_frames_that_were_not(night
     assert in_use.moving_rms_px is not None
     assert own.candidates[0].moving_rms_px is not None
     assert np.hypot(*in_use.moving_rms_px) > 5 * np.hypot(*own.candidates[0].moving_rms_px)
-    assert better(alike, own).form == "thermal"
+    assert select_better(alike, own).form == "thermal"
     unseen = [one.model_copy(update={"moving_rms_px": None}) for one in alike.candidates]
-    assert better(replace(alike, candidates=tuple(unseen)), own).form == "paper"
+    assert select_better(replace(alike, candidates=tuple(unseen)), own).form == "paper"
 
 
 @pytest.mark.parametrize("air_degC", [15.0, 34.0])
@@ -102,7 +107,7 @@ def test_a_warm_up_elsewhere_is_predicted_when_one_was_recorded_and_not_otherwis
 def test_plays_help_a_camera_with_play_and_are_not_taken_for_one_without(thermal: ThermalModel):
     loose = session(warm_up(24.0) + reference() + cycle(), plays=True)
     model = fit_thermal(loose[0])
-    plays = [isinstance(term, OfPlay) for term in model.terms]
+    plays = [isinstance(term, BacklashTerm) for term in model.terms]
     of_loose_px, of_tight_px = (np.abs(one.coefficients[:2, plays]).max() for one in (model, thermal))
     assert of_tight_px < 0.003 < 0.03 < of_loose_px
     assert left_mpx(fit_paper(loose[0], 4), loose, Role.VALIDATION) > 50.0
@@ -118,7 +123,7 @@ def test_the_95_percent_interval_holds_95_percent_at_held_out_temperatures(night
 
 
 def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night: Seen, thermal: ThermalModel):
-    states = frame_states(night[0], thermal.memory)
+    states = compute_frame_states(night[0], thermal.memory)
     usual = states.where(np.flatnonzero(night[0].of(Role.FIT))[:1])
     hot = States(usual.memory, usual.rows + np.where(np.arange(usual.rows.shape[1]) == 0, 60.0, 0.0))
     points = np.array([[1200.0, 1000.0], [2200.0, 1600.0]])
@@ -130,7 +135,7 @@ def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night:
 
 def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
     inside = night[0].of(Role.FIT, Role.VALIDATION, Role.WARM_UP)
-    states = frame_states(night[0], thermal.memory)
+    states = compute_frame_states(night[0], thermal.memory)
     point = np.array([[1200.0, 1000.0]])
     assert not any(thermal.flags(point, states.where(np.array([k])))[0] for k in np.flatnonzero(inside))
     usual = states.where(np.flatnonzero(inside)[-1:])
@@ -156,7 +161,7 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
 def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, thermal: ThermalModel):
     record = night[0].histories[0]
     end = 2000
-    state = state_of(thermal.memory)
+    state = make_initial_state(thermal.memory)
     camera_degC = np.interp(record.ambient_ns, record.camera_ns, record.camera_degC)
     off = ~np.isin(record.ambient_ns, record.camera_ns)
     for index in range(1, end):
@@ -164,9 +169,9 @@ def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, ther
         stated = np.nan if off[index] else camera_degC[index]
         state.advance(10.0, mean, record.powered[index - 1], stated)
     at_ns = record.ambient_ns[end - 1 : end]
-    offline = states_at(record, thermal.memory, at_ns, camera_degC[end - 1 : end])
+    offline = compute_states_at(record, thermal.memory, at_ns, camera_degC[end - 1 : end])
     point = np.array([[1200.0, 1000.0]])
-    live = States(thermal.memory, row_of(state)[None])
+    live = States(thermal.memory, read_state_row(state)[None])
     np.testing.assert_allclose(thermal.shift(point, live), thermal.shift(point, offline), atol=1e-6)
 
 
@@ -229,7 +234,7 @@ NONE_PX2 = np.zeros((0, 2))
 
 
 def test_of_one_night_it_is_assumed_and_says_so():
-    found = between_nights(np.array([0.0, 0.010]), NONE_PX2)
+    found = estimate_between_sessions(np.array([0.0, 0.010]), NONE_PX2)
     assert found.is_assumed
     assert "assumed, not measured" in found.text
     # Four nights' worth: Student's t of 4 degrees of freedom reaches 2.776 where a normal distribution reaches 1.960.
@@ -238,11 +243,13 @@ def test_of_one_night_it_is_assumed_and_says_so():
 
 def test_nights_that_agree_make_it_smaller_and_nights_that_do_not_larger():
     left_px = np.array([0.004, 0.004])
-    agreeing = [between_nights(left_px, np.full((nights, 2), left_px**2)).sigma_px[0] for nights in (0, 2, 4, 12)]
+    agreeing = [
+        estimate_between_sessions(left_px, np.full((nights, 2), left_px**2)).sigma_px[0] for nights in (0, 2, 4, 12)
+    ]
     assert agreeing == sorted(agreeing, reverse=True)
     assert agreeing[-1] < 0.5 * agreeing[0]
     off_px2 = np.full((2, 2), 0.020**2)
-    found = between_nights(left_px, off_px2)
+    found = estimate_between_sessions(left_px, off_px2)
     assert not found.is_assumed
     assert found.sigma_px[0] > 2 * agreeing[0]
     assert "as 2 nights show" in found.text
@@ -252,4 +259,4 @@ def test_with_many_nights_it_is_what_they_show():
     """Nights that differ by 10 mpx, one standard deviation."""
     rng = np.random.default_rng(1)
     left_px2 = 0.003**2 + (0.010 * rng.standard_normal((400, 2))) ** 2
-    assert between_nights(np.full(2, 0.003), left_px2).sigma_px == pytest.approx((0.010, 0.010), rel=0.1)
+    assert estimate_between_sessions(np.full(2, 0.003), left_px2).sigma_px == pytest.approx((0.010, 0.010), rel=0.1)

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from thermostand.compensation.drift_runtime import ThermalState
-from thermostand.compensation.expression import AIR, CAMERA, POWER, lag, play
+from thermostand.compensation.expression import AIR, CAMERA, POWER, backlash, lag
 from thermostand.compensation.history.thermal_history import (
     States,
     ThermalHistory,
-    ThermalMemory,
-    refined,
-    row_of,
-    state_of,
-    states_at,
+    ThermalStateSpec,
+    compute_states_at,
+    make_initial_state,
+    read_state_row,
+    refine_temperature,
 )
 
 S = 1_000_000_000
 TAUS_S = (600.0, 3600.0)
 AIR_LAGS, POWER_LAGS, CAMERA_LAGS = ([lag(of, tau_s) for tau_s in TAUS_S] for of in (AIR, POWER, CAMERA))
-PLAY = play(CAMERA, 2.0)
-MEMORY = ThermalMemory((*AIR_LAGS, *POWER_LAGS, *CAMERA_LAGS, PLAY), 20.0)
+PLAY = backlash(CAMERA, 2.0)
+MEMORY = ThermalStateSpec((*AIR_LAGS, *POWER_LAGS, *CAMERA_LAGS, PLAY), 20.0)
 STEP_AT_S, END_S = 3600, 4 * 3600
 
 
@@ -46,7 +46,7 @@ def history(
 
 def at(record: ThermalHistory, *seconds: int, camera_degC: float = 54.0) -> States:
     times_ns = np.array(seconds, np.int64) * S
-    return states_at(record, MEMORY, times_ns, np.full(len(times_ns), camera_degC))
+    return compute_states_at(record, MEMORY, times_ns, np.full(len(times_ns), camera_degC))
 
 
 @pytest.mark.parametrize("after_s", [600, 1800, 7200])
@@ -76,7 +76,7 @@ def test_a_part_between_air_and_camera_has_plays_of_its_own():
     """Switched on, the chip is 20 K warmer and the part 0.3 of that; its play is left 2 K behind, and behind 54 degC of
     the air when all has settled there."""
     air, camera = AIR_LAGS[0], CAMERA_LAGS[0]
-    state = ThermalState((air, camera, PLAY, play(air + 0.3 * (camera - air), 2.0)), 20.0)
+    state = ThermalState((air, camera, PLAY, backlash(air + 0.3 * (camera - air), 2.0)), 20.0)
     state.advance(10.0, 24.0, 1.0, 24.0)
     assert state.values[-2:] == [24.0, 24.0]
     for _ in range(2000):
@@ -101,7 +101,7 @@ def test_a_warm_start_is_a_guess_and_a_cold_one_is_known():
 
 @pytest.mark.parametrize(("stated_degC", "known"), [(21.0, True), (27.0, False)])
 def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equilibrium(stated_degC: float, known: bool):
-    state = state_of(MEMORY)
+    state = make_initial_state(MEMORY)
     for _ in range(100):
         state.advance(10.0, 20.0, 0.0, math.nan)
     assert state.settled_s == 1000.0
@@ -110,7 +110,7 @@ def test_a_camera_that_is_as_cold_as_the_air_when_it_is_switched_on_was_in_equil
 
 
 def test_a_camera_that_was_on_before_and_is_cold_after_a_pause_is_known_no_better():
-    state = state_of(MEMORY)
+    state = make_initial_state(MEMORY)
     state.advance(10.0, 20.0, 1.0, 40.0)
     for _ in range(600):
         state.advance(10.0, 20.0, 0.0, math.nan)
@@ -139,11 +139,11 @@ def test_after_a_gap_the_state_is_a_guess_again():
 
 def test_samples_one_by_one_give_the_same_state_as_the_recording():
     record = history()
-    state = state_of(MEMORY)
+    state = make_initial_state(MEMORY)
     for second in range(10, 6001, 10):
         air = [24.0 if edge <= STEP_AT_S else 34.0 for edge in (second - 10, second)]
         state.advance(10.0, sum(air) / 2, 1.0, air[1] + 20.0)
-    np.testing.assert_allclose(row_of(state), at(record, 6000).rows[0], rtol=1e-9)
+    np.testing.assert_allclose(read_state_row(state), at(record, 6000).rows[0], rtol=1e-9)
     assert state.camera_degC == 54.0
 
 
@@ -163,7 +163,7 @@ def test_a_display_in_quarters_is_refined_between_its_steps():
     true = 24 + 18 * -np.expm1(-times_s / 700) + 2 * -np.expm1(-times_s / 3000)
     stated = 0.25 * np.round(true / 0.25)
     powered_ns = np.array([0], np.int64)
-    record = refined(
+    record = refine_temperature(
         ThermalHistory(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, stated)
     )
     assert record.resolution_K == 0.25
@@ -172,11 +172,11 @@ def test_a_display_in_quarters_is_refined_between_its_steps():
     assert np.std(error) < 0.02
     assert np.abs(record.camera_degC - stated).max() <= 0.125 + 1e-9
     fine = ThermalHistory(times_s * S, np.full(len(times_s), 24.0), powered_ns, np.ones(1), times_s * S, true)
-    np.testing.assert_array_equal(refined(fine).camera_degC, true)
+    np.testing.assert_array_equal(refine_temperature(fine).camera_degC, true)
 
 
 def test_a_play_stays_until_it_is_pushed_from_either_side():
-    state = ThermalState((play(CAMERA, 1.0), play(CAMERA, 3.0)), 20.0)
+    state = ThermalState((backlash(CAMERA, 1.0), backlash(CAMERA, 3.0)), 20.0)
     places: list[list[float]] = []
     for camera_degC in (0.0, 0.5, 5.0, 3.5, -2.0):
         state.advance(10.0, 0.0, 1.0, camera_degC)

@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermostand.compensation.drift.bumps import Cause, Unrepeated, find_bumps, find_unrepeated
-from thermostand.compensation.drift.choosing import fit
+from thermostand.compensation.drift.bumps import Cause, UnrepeatedMotion, find_bumps, find_unrepeated
 from thermostand.compensation.drift.evaluation import evaluate
+from thermostand.compensation.drift.model_selection import fit
 from thermostand.compensation.reporting.report import write_report
 
-from .drawn_cameras import drawn_camera
-from .drawn_nights import followed_cycle, full_night, night, reference, warm_up
+from .drawn_cameras import draw_camera
+from .drawn_sessions import make_followed_cycle, make_full_session, record_session, reference, warm_up
 
 DIRECTION = np.array([0.6, -0.8])
 
 
-def of(seed: int, *effects: str, moving: bool = False) -> Unrepeated:
+def of(seed: int, *effects: str, moving: bool = False) -> UnrepeatedMotion:
     """Its slips are those of a joint that gives way after 4 K or so, by 20 mpx; its fixings settle within 8 mpx."""
-    camera = replace(drawn_camera(seed, *effects), slip_K=4.0, slip_px_per_K=0.005 * DIRECTION, fixing_px=0.008)
-    parts = [*warm_up(), *reference(), *followed_cycle()] if moving else full_night()
-    observed = night(camera, parts, seed).observed
+    camera = replace(draw_camera(seed, *effects), slip_K=4.0, slip_px_per_K=0.005 * DIRECTION, fixing_px=0.008)
+    parts = [*warm_up(), *reference(), *make_followed_cycle()] if moving else make_full_session()
+    observed = record_session(camera, parts, seed).observed
     (found,) = find_unrepeated(observed, find_bumps(observed))
     return found
 
@@ -48,8 +48,8 @@ def test_what_repeats_is_no_slip() -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_report_says_so(tmp_path: Path) -> None:
-    camera = replace(drawn_camera(2300, "stick_slip"), slip_K=4.0, slip_px_per_K=0.005 * DIRECTION)
-    observed = night(camera, full_night(), 2300).observed
+    camera = replace(draw_camera(2300, "stick_slip"), slip_K=4.0, slip_px_per_K=0.005 * DIRECTION)
+    observed = record_session(camera, make_full_session(), 2300).observed
     model = fit(observed, form="thermal")
     write_report(tmp_path / "report.html", observed, model, evaluate(model, observed))
     assert "sticks and slips" in (tmp_path / "report.html").read_text()

@@ -12,24 +12,30 @@ import pytest
 
 from thermostand.compensation.calibration.adjustment import adjust
 from thermostand.compensation.calibration.calibrate import Model, calibrate
-from thermostand.compensation.calibration.camera_file import CameraFile, camera_file
-from thermostand.compensation.calibration.session_centres import mean_centres
+from thermostand.compensation.calibration.camera_file import CameraFile, build_camera_file
+from thermostand.compensation.calibration.session_centres import average_centres
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.observations import Float
-from thermostand.compensation.reporting.pages import validation_page
-from thermostand.compensation.validation3d.document import TABLE_1, AFTER_mm, BEFORE_mm, as_json, summary
+from thermostand.compensation.reporting.pages import render_validation_page
+from thermostand.compensation.validation3d.document import (
+    TABLE_1,
+    AFTER_mm,
+    BEFORE_mm,
+    format_summary,
+    serialise_validation,
+)
 from thermostand.compensation.validation3d.validate import (
     CalibratedCamera,
+    CentreUncertainty,
     Deviations,
-    Doubts,
     LensModel,
     SpatialValidation,
-    camera_of,
     check_same,
-    deviations,
-    find,
+    compute_deviations,
+    find_target_pose,
+    select_lens_model,
     validate,
 )
 from thermostand.foundation.errors import CalibrationError, SessionError
@@ -77,7 +83,7 @@ def validated(laboratory: Laboratory, camera: CalibratedCamera, model: PaperMode
 
 def undrifted(laboratory: Laboratory, camera: CalibratedCamera, **options: Any) -> Deviations:
     observed, frames = validation_session(laboratory, TRUTH, **options)
-    return deviations("as found", camera, observed, frames, observed.centres_px)
+    return compute_deviations("as found", camera, observed, frames, observed.centres_px)
 
 
 def test_without_drift_nothing_deviates_by_more_than_the_noise(laboratory: Laboratory, camera: CalibratedCamera):
@@ -143,12 +149,12 @@ def test_the_drift_models_uncertainty_reaches_the_pose(laboratory: Laboratory, c
     model_px2 = np.tile(0.003**2 * np.eye(2), (54, 1, 1))
 
     def place_um(shift_px: Float) -> Float:
-        mean = mean_centres((centres + shift_px)[None], covariance[None])
-        return 1e3 * find(camera.lens, camera.board, mean, 1.0, Doubts(), SIZE[0]).place_mm
+        mean = average_centres((centres + shift_px)[None], covariance[None])
+        return 1e3 * find_target_pose(camera.lens, camera.board, mean, 1.0, CentreUncertainty(), SIZE[0]).place_mm
 
     places = np.array([place_um(0.003 * root @ random.standard_normal((54, 2))) for _ in range(200)])
-    mean = mean_centres(centres[None], covariance[None])
-    claimed = find(camera.lens, camera.board, mean, 1.0, Doubts(model_px2), SIZE[0]).model
+    mean = average_centres(centres[None], covariance[None])
+    claimed = find_target_pose(camera.lens, camera.board, mean, 1.0, CentreUncertainty(model_px2), SIZE[0]).model
     assert places.std(axis=0) == pytest.approx(1e3 * np.sqrt(np.diagonal(claimed)[3:]), rel=0.15)
 
 
@@ -167,10 +173,10 @@ def test_a_pose_that_was_not_seen_is_left_out_of_the_means_and_shown_as_unknown(
     assert np.argwhere(np.isnan(found.after.repeat_um[:, 0])).tolist() == [[2]]
     assert np.isfinite(found.after.mean_um).all()
     assert found.frame_count[2].tolist() == [1, 0, 1, 1]
-    document = json.loads(as_json(found))
+    document = json.loads(serialise_validation(found))
     assert document["results"][1]["translation_um"][2][1] == [None, None, None]
     assert document["outside_valid_range"][2][1] is None
-    assert ["", "V1", *"------"] in cells(validation_page(found))
+    assert ["", "V1", *"------"] in cells(render_validation_page(found))
 
 
 def test_a_reference_without_a_pose_is_refused(laboratory: Laboratory, camera: CalibratedCamera, model: PaperModel):
@@ -188,23 +194,23 @@ def test_corrections_beyond_the_models_range_are_flagged(
     assert np.all(warm.flags[1] & Outside.CAMERA)
     assert np.all(warm.outside[1] == 1)
     assert not np.any(warm.flags[0] & Outside.CAMERA)
-    assert "camera" in summary(warm).splitlines()[-1]
+    assert "camera" in format_summary(warm).splitlines()[-1]
     assert not np.any(validated.flags & Outside.CAMERA)
 
 
 def test_table_figures_and_document_show_the_papers_beside_ours(validated: SpatialValidation):
-    text = summary(validated)
+    text = format_summary(validated)
     assert "paper, after" in text
     assert text.splitlines()[3].split() == ["paper,", "after", "12.4", "25.4", "28.7"]
     assert f"{validated.after.mean_um[2]:.2f} (u ≤ {validated.after.u_mean_um[2]:.2f})" in text
-    page = validation_page(validated)
+    page = render_validation_page(validated)
     rows = cells(page)
     assert page.count("<svg") == 2
     assert rows.count(["", "aver (abs)", "0.0298", "0.2126", "0.2326", "0.0204", "0.0411", "0.0499"]) == 1
     ours = validated.before.translation_um[1, 0], validated.after.translation_um[1, 0]
     wanted = [f"{value / 1e3:.4f}" for value in np.concatenate(ours)]
     assert [f"{validated.camera_degC[1]:.2f}", "V0", *wanted] in rows
-    document = json.loads(as_json(validated))
+    document = json.loads(serialise_validation(validated))
     assert document["results"][1]["mean_um"] == validated.after.mean_um.tolist()
     assert [one["name"] for one in document["positions"]] == ["V0", "V1", "V2", "V3"]
 
@@ -220,14 +226,14 @@ def test_the_papers_averages_are_those_of_its_own_table():
 @pytest.fixture(scope="module")
 def file(laboratory: Laboratory) -> CameraFile:
     found = calibrate(positions(laboratory), target_of(laboratory), TABLE, Model.BROWN)
-    return camera_file(
+    return build_camera_file(
         found, camera_serial="TS-0001", session_ids=("night-2",), target_name="paper-9x6", software_version="0"
     )
 
 
 def test_pinhole_and_rays_agree(laboratory: Laboratory, file: CameraFile, model: PaperModel):
     observed, frames = validation_session(laboratory, TRUTH, drift, temperatures_degC=(24.0, 43.0))
-    pinhole, rays = (validate(observed, frames, camera_of(file, lens), model) for lens in LensModel)
+    pinhole, rays = (validate(observed, frames, select_lens_model(file, lens), model) for lens in LensModel)
     assert rays.after.translation_um == pytest.approx(pinhole.after.translation_um, abs=0.3)
     assert (pinhole.lens, rays.lens) == (file.model, f"rays, degree {file.ray_lens.degree}")
 

@@ -18,13 +18,13 @@ from typer.testing import CliRunner, Result
 from thermostand.compensation import cli
 from thermostand.compensation.budget.geometry import load_geometry
 from thermostand.compensation.calibration.calibrate import Model, calibrate
-from thermostand.compensation.calibration.camera_file import camera_file
+from thermostand.compensation.calibration.camera_file import build_camera_file
 from thermostand.compensation.calibration.session_centres import Positions
 from thermostand.compensation.calibration.stage_geometry import TableSigma
 from thermostand.compensation.drift.model_file import save_model
 from thermostand.compensation.drift.paper_model import fit_paper
-from thermostand.compensation.observations import Float, Observations, observe_session, session_target
-from thermostand.compensation.validation3d.validate import validation_frames
+from thermostand.compensation.observations import Float, Observations, observe_session, read_session_target
+from thermostand.compensation.validation3d.validate import select_validation_frames
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.documents import parse_document
@@ -35,7 +35,7 @@ from thermostand.markers.target import Target
 from thermostand.recording.reading.session import Session
 
 from .conftest import record_items
-from .rendered import Scene, photograph, render, true_centres_px
+from .renderer import Scene, compute_true_centres_px, photograph, render
 from .synthetic import observations as thermal_cycle
 
 START_NS = 1_767_290_400 * NS_PER_S
@@ -89,7 +89,7 @@ async def record(directory: Path, visits: int = len(VISITS), silent: str = "") -
 def calibration_positions() -> Positions:
     """Noise-free but for 3 mpx, at nine places around V0 and V1."""
     places = np.array([(linear, rotary) for linear in (-40.0, 30.0, 100.0) for rotary in (-25.0, 0.0, 25.0)])
-    centres = np.array([true_centres_px(scene_at((linear, rotary))) for linear, rotary in places])
+    centres = np.array([compute_true_centres_px(scene_at((linear, rotary))) for linear, rotary in places])
     noise = 0.003 * np.random.default_rng(2).standard_normal(centres.shape)
     return Positions(
         linear_mm=places[:, 0],
@@ -105,7 +105,7 @@ def calibration_positions() -> Positions:
 
 def cycle() -> Observations:
     """A thermal cycle of the small camera, the target at V0."""
-    at_V0 = true_centres_px(scene_at(V0))
+    at_V0 = compute_true_centres_px(scene_at(V0))
 
     def drift(_: Float, above_K: float) -> Float:
         return at_V0 + np.array([0.0, SHIFT_px_K * above_K])
@@ -119,7 +119,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("validation")
     asyncio.run(record(folder / "session"))
     found = calibrate(calibration_positions(), TARGET, TableSigma(), Model.BROWN)
-    camera_file(
+    build_camera_file(
         found, camera_serial="TS-0001", session_ids=("night-2",), target_name="small", software_version="0"
     ).save(folder / "camera.json")
     save_model(fit_paper(cycle(), 1), folder / "model.json")
@@ -222,7 +222,7 @@ def test_a_session_with_something_missing_is_validated_only_when_that_is_asked_f
 
 def test_pose_frames_teach_the_drift_nothing(folder: Path):
     session = Session.open(folder / "session")
-    observed = observe_session(session, session_target(session))
+    observed = observe_session(session, read_session_target(session))
     assert observed.role.tolist() == ["pose", "pose", "repeatability"] * 2
     with pytest.raises(SessionError, match="no usable frames"):
         fit_paper(observed, 1)
@@ -231,10 +231,10 @@ def test_pose_frames_teach_the_drift_nothing(folder: Path):
 
 def test_frames_are_sorted_by_where_the_table_stood_not_by_their_order(folder: Path):
     session = Session.open(folder / "session")
-    observed = observe_session(session, session_target(session))
-    found = validation_frames(session, observed)
+    observed = observe_session(session, read_session_target(session))
+    found = select_validation_frames(session, observed)
     assert found.names == ("V0", "V1")
     assert [[indices.tolist() for indices in row] for row in found.frames] == [[[0], [1], [2]], [[3], [4], [5]]]
     assert found.used.tolist() == [0, 1, 2, 3, 4, 5]
     with pytest.raises(SessionError, match="60 mm, 20 deg"):
-        validation_frames(session, replace(observed, reasons=("", "dark", "", "", "", "")))
+        select_validation_frames(session, replace(observed, reasons=("", "dark", "", "", "", "")))

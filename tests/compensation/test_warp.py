@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from tests.compensation.rendered import Scene, render
-from tests.nightly import by_night
-from thermostand.compensation.apply.compensate_images import warp
+from tests.compensation.renderer import Scene, render
+from tests.nightly import mark_nightly
+from thermostand.compensation.apply.image_correction import warp
 from thermostand.compensation.drift_runtime import LATTICE_PX, source_offset
 from thermostand.markers.detection import detect
 from thermostand.markers.target import load_target
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 SMALL = (200, 160)
 
@@ -42,7 +42,7 @@ def scene(x, y):
 
 @pytest.mark.parametrize(
     ("shift", "dtype"),
-    [(drift, np.uint8), (across_zero, np.uint16), by_night(drift, np.uint16), by_night(across_zero, np.uint8)],
+    [(drift, np.uint8), (across_zero, np.uint16), mark_nightly(drift, np.uint16), mark_nightly(across_zero, np.uint8)],
 )
 def test_every_pixel_is_that_of_the_scene_at_the_place_it_comes_from(shift, dtype):
     """As near as a cubic B-spline comes in twice the precision, and a little of what rounding leaves."""
@@ -79,7 +79,7 @@ def test_the_place_a_point_comes_from_is_the_inverse_of_the_shift():
 
 
 def test_markers_are_found_where_the_shift_puts_them_within_half_a_thousandth_of_a_pixel():
-    target = load_target(packaged("targets", "paper-9x6"))
+    target = load_target(find_packaged("targets", "paper-9x6"))
     image = (256 * render(Scene(psf_px=0.8, tilt_y_deg=4, roll_deg=1))).astype(np.uint16)
     before = detect(image, target).centres_px
     after = detect(np.round(warp(image, drift)).astype(np.uint16), target).centres_px

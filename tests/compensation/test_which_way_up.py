@@ -9,12 +9,12 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.markers.detection import DetectionError, Flag, detect
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import DonutMarkers, OddMarker, Target
 
-from .rendered import Scene, photograph, render, true_centres_px
+from .renderer import Scene, compute_true_centres_px, photograph, render
 from .test_markers import HALF, PAPER, rms_mpx
 
 MARKED = PAPER.model_copy(update={"odd_marker": OddMarker(number=1, diameter_mm=14.0)})
@@ -32,14 +32,14 @@ def shifted(scene: Scene, x_px: float, y_px: float) -> Scene:
     ("side", "cut"),
     [
         *[("left", "beyond"), ("right", "half"), ("top", "a tenth"), ("bottom", "beyond")],
-        *[by_night("left", "half"), by_night("left", "a tenth"), by_night("right", "beyond")],
-        *[by_night("right", "a tenth"), by_night("top", "beyond"), by_night("top", "half")],
-        *[by_night("bottom", "half"), by_night("bottom", "a tenth")],
+        *[mark_nightly("left", "half"), mark_nightly("left", "a tenth"), mark_nightly("right", "beyond")],
+        *[mark_nightly("right", "a tenth"), mark_nightly("top", "beyond"), mark_nightly("top", "half")],
+        *[mark_nightly("bottom", "half"), mark_nightly("bottom", "a tenth")],
     ],
 )
 def test_a_side_of_the_grid_beyond_the_frame_is_found_by_the_frame(side: str, cut: str):
     scene = replace(SCENE, roll_deg=0)
-    truth, (width, height) = true_centres_px(scene), scene.size
+    truth, (width, height) = compute_true_centres_px(scene), scene.size
     radius = 4 * scene.f_px / scene.distance_mm
     inside = {"beyond": -2 * radius, "half": 0.0, "a tenth": 0.8 * radius}[cut]
     moves = {
@@ -78,7 +78,9 @@ def test_three_donuts_tell_the_turn_and_are_measured_like_the_others(roll_deg: f
     found = detect(photograph(scene, render(scene), 1), target)
     assert found.found == 54
     assert not found.flags.any()
-    sigmas = (found.centres_px - true_centres_px(scene)) / np.sqrt(np.diagonal(found.covariance_px2, axis1=1, axis2=2))
+    sigmas = (found.centres_px - compute_true_centres_px(scene)) / np.sqrt(
+        np.diagonal(found.covariance_px2, axis1=1, axis2=2)
+    )
     assert np.abs(sigmas[target.is_donut()]).max() < 4
     assert detect(photograph(scene, render(scene), 2), target, found).found == 54
 
@@ -89,7 +91,7 @@ def test_a_mirrored_image_of_a_target_with_donuts_is_refused_and_one_filled_by_d
     for mirrored in (image[:, ::-1], image[::-1]):
         with pytest.raises(DetectionError, match=r"mirrored, .* 20, 22 and 40"):
             detect(np.ascontiguousarray(mirrored), DONUTS)
-    u, v = np.rint(true_centres_px(WITH_HOLES)[[19, 30]]).astype(int).T
+    u, v = np.rint(compute_true_centres_px(WITH_HOLES)[[19, 30]]).astype(int).T
     dirty, shining = image.copy(), image.copy()
     dirty[v[0] - 9 : v[0] + 10, u[0] - 9 : u[0] + 10] = 30
     shining[v[1] - 8 : v[1] + 9, u[1] - 8 : u[1] + 9] = 200

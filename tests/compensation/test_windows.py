@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.foundation.readings import Frame
 from thermostand.markers.detection import Flag, detect
 from thermostand.markers.target import load_target
-from thermostand.markers.windows import MARGIN_px, marker_windows
+from thermostand.markers.windows import MARGIN_px, find_marker_windows
 from thermostand.recording.format.images import MarkerWindows
 
-from .rendered import Scene, photograph, project, render
+from .renderer import Scene, photograph, project, render
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
 HALF = Scene(size=(1224, 1024), f_px=4386)
@@ -35,7 +35,7 @@ def outlines_px(scene):
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_window_is_its_markers_bounding_box_and_the_margin(view):
     scene = VIEWS[view]
-    windows = marker_windows(photograph(scene, render(scene), 1), PAPER)
+    windows = find_marker_windows(photograph(scene, render(scene), 1), PAPER)
     assert windows.dtype == np.int32
     assert windows.shape == (54, 4)
     outlines = outlines_px(scene)
@@ -49,28 +49,28 @@ def test_windows_end_at_the_edges_of_the_image():
     # The outermost outlines are 6 px from the left edge of the image, less than the margin.
     scene = dataclasses.replace(HALF, shift_mm=(-13.9, 0))
     image = photograph(scene, render(scene), 1)
-    windows = marker_windows(image, PAPER)
+    windows = find_marker_windows(image, PAPER)
     assert windows[:, 0].min() == 0
     assert (windows[:, :2] + windows[:, 2:] <= image.shape[::-1]).all()
 
 
 def test_without_one_marker_there_are_no_windows():
     scene = dataclasses.replace(HALF, missing=(30,))
-    assert marker_windows(photograph(scene, render(scene), 1), PAPER) is None
+    assert find_marker_windows(photograph(scene, render(scene), 1), PAPER) is None
 
 
 @pytest.mark.parametrize("level_DN", [3, 120, 255])
 def test_in_an_even_image_there_are_no_windows(level_DN):
-    assert marker_windows(np.full((512, 612), level_DN, np.uint8), PAPER) is None
+    assert find_marker_windows(np.full((512, 612), level_DN, np.uint8), PAPER) is None
 
 
 def test_an_image_too_small_for_any_marker_has_no_windows():
-    assert marker_windows(np.zeros((3, 3), np.uint8), PAPER) is None
+    assert find_marker_windows(np.zeros((3, 3), np.uint8), PAPER) is None
 
 
 def partial(images):
     """What a recorder keeps of the second image when the first was whole."""
-    keep = MarkerWindows(lambda image: marker_windows(image, PAPER))
+    keep = MarkerWindows(lambda image: find_marker_windows(image, PAPER))
     times = (0, 1_000_000_000)
     frames = [Frame("camera.image", image, t, 0.1, 0.0, 40.0, 1, 1) for image, t in zip(images, times, strict=True)]
     first, second = map(keep, frames)
@@ -84,7 +84,7 @@ def partial(images):
     ("view", "dtype", "gain"),
     [
         *[("frontal", np.uint16, 16), ("tilted", np.uint8, 1)],
-        *[by_night("frontal", np.uint8, 1), by_night("tilted", np.uint16, 16)],
+        *[mark_nightly("frontal", np.uint8, 1), mark_nightly("tilted", np.uint16, 16)],
     ],
 )
 def test_centres_from_a_partial_frame_are_those_of_the_whole_one(view, dtype, gain):

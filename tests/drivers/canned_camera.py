@@ -8,7 +8,7 @@ from tests.drivers.canned_line import Feed, Parser
 from tests.sim.gvcp_client import decode_ack
 from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
-from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.genicam import make_features
 
 _MEMORY, _MEMORY_SIZE = 0x10000, 0x400  # of the features
 _PEER = ("127.0.0.1", 40001)
@@ -40,7 +40,7 @@ class _Silent:
 
 def gvcp_commands() -> Parser:
     def make() -> Feed:
-        registers = Registers(features(64, 48, "SN1"), "127.0.0.71", "SN1")
+        registers = Registers(make_features(64, 48, "SN1"), "127.0.0.71", "SN1")
         channel = ControlChannel(registers, _Silent())
 
         def feed(number: int, wire: bytes) -> bool:

@@ -121,7 +121,7 @@ def simserv() -> Parser:
         return code.decode("latin-1"), [value.decode("latin-1") for value in values]
 
     def answer(number: int, heard: bytes) -> Any:
-        found = chamber_simserv.reply_of(heard)
+        found = chamber_simserv.parse_reply(heard)
         assert found is None or found[0] == "1" or (found[0][0] == "-" and not found[1])
         return found
 
@@ -139,7 +139,7 @@ def julabo() -> Parser:
 
     return _language(
         _JULABO,
-        lambda number, heard: (chamber_julabo.status_of if number > 1 else chamber_julabo.number_of)(heard),
+        lambda number, heard: (chamber_julabo.parse_status if number > 1 else chamber_julabo.parse_temperature)(heard),
         truth,
     )
 
@@ -202,7 +202,7 @@ def cts(kind: str) -> Parser:
         name, *fields = text.split(b" ")
         return tuple(float(field) for field in fields) if (name, len(text)) == (b"A0", 14) else None
 
-    frames = [chamber_cts.framed(1, text) if kind == "serial" else text.encode() for text in _CTS]
+    frames = [chamber_cts.wrap_frame(1, text) if kind == "serial" else text.encode() for text in _CTS]
     return _language(frames, lambda number, heard: answer(heard), truth)
 
 
@@ -228,5 +228,5 @@ def cts_state(kind: str) -> Parser:
         sound = text is not None and len(text) == 10 and text[:1] == b"S" and not text[1:9].strip(b"01?")
         return (text[1:9].decode(), text[9:].decode("latin-1")) if text is not None and sound else None
 
-    frames = [chamber_cts.framed(1, text) if kind == "serial" else text.encode() for text in _CTS_STATE]
+    frames = [chamber_cts.wrap_frame(1, text) if kind == "serial" else text.encode() for text in _CTS_STATE]
     return _language(frames, lambda number, heard: answer(heard), truth)

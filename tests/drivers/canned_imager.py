@@ -6,8 +6,8 @@ import numpy as np
 
 from tests.drivers.canned_line import Feed, Parser
 from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
-from thermostand.drivers.devices.imager.radiometry import temperatures_degC
-from thermostand.drivers.sim.units.thermal_imager import RadiometricShot, counts_of, jpeg_of
+from thermostand.drivers.devices.imager.radiometry import compute_temperatures_degC
+from thermostand.drivers.sim.units.thermal_imager import RadiometricShot, compute_counts, make_jpeg
 
 _SCENE_DEGC = np.linspace(10.0, 50.0, 64).reshape(8, 8)
 _SPOTS = {"lens": (3, 4), "1": (5, 5)}
@@ -16,7 +16,7 @@ _SHOTS = [RadiometricShot(_SCENE_DEGC, 1.7e9, spots=_SPOTS, png=png, emissivity=
 
 def radiometric() -> Parser:
     """Small pictures, so that the directory and the records are hit, too."""
-    frames = [jpeg_of(shot) for shot in _SHOTS]
+    frames = [make_jpeg(shot) for shot in _SHOTS]
     sound = [frame.index(b"FFF\0") for frame in frames]
 
     def make() -> Feed:
@@ -26,12 +26,12 @@ def radiometric() -> Parser:
                 image = parse(wire)
             except NotRadiometric:
                 return False
-            degC = temperatures_degC(image.counts, image.planck, image.around, 0.95)
+            degC = compute_temperatures_degC(image.counts, image.planck, image.around, 0.95)
             assert degC.shape == image.counts.shape
             assert not np.isinf(degC).any()
             begin, frame = sound[number], frames[number]
             if wire[begin : begin + len(frame)] == frame[begin:]:  # damaged before its temperatures only
-                assert np.array_equal(image.counts, counts_of(_SCENE_DEGC, 0.95))
+                assert np.array_equal(image.counts, compute_counts(_SCENE_DEGC, 0.95))
             return True
 
         return feed

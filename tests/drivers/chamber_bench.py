@@ -24,7 +24,7 @@ from thermostand.drivers.sim.units.climate_chambers import (
 )
 from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.line_client import LineClient
-from thermostand.foundation.clock import Clock, FollowedClock, WallClock, seconds_ns
+from thermostand.foundation.clock import Clock, FollowedClock, WallClock, to_ns
 from thermostand.foundation.readings import Reading
 
 LIMIT_S = 60.0  # of what comes at once; a test that fails is not to hang
@@ -119,7 +119,7 @@ class Bench:
         return FakeWeiss(self.plant, self.clock)
 
     def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        self.clock.follow(self.clock.now_ns() + to_ns(duration_s))
         with self.fake.now():
             pass
 

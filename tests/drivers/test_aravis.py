@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Functions, library, load
+from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, AravisError, Functions, load, load_library
 from thermostand.drivers.wires.aravis import GigeDevice
 from thermostand.foundation.errors import StandError
 
@@ -10,7 +10,7 @@ from thermostand.foundation.errors import StandError
 @pytest.fixture
 def aravis() -> Functions:
     try:
-        return library()
+        return load_library()
     except StandError as error:
         if os.environ.get("CI") == "true":
             raise

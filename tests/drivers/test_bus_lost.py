@@ -13,7 +13,7 @@ import pytest
 from tests.drivers.bus_responder import TIMEOUT_S, Fault, Responder, flip, frame, late, read_is_right
 from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
-from thermostand.foundation.clock import VirtualClock, WallClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, WallClock, to_ns
 from thermostand.foundation.errors import GarbledReply, Unreachable
 
 
@@ -51,7 +51,7 @@ async def test_a_dead_unit_is_skipped_and_probed_at_growing_intervals_and_the_ot
     responder.silent_units = {2}
     asked: list[int] = []
     for second in range(24):
-        await clock.sleep_until(seconds_ns(second))
+        await clock.sleep_until(to_ns(second))
         before = len(responder.requests)
         with pytest.raises(Unreachable):
             await read_is_right(bus, 0, unit=2)
@@ -63,7 +63,7 @@ async def test_a_dead_unit_is_skipped_and_probed_at_growing_intervals_and_the_ot
     with pytest.raises(Unreachable):  # a write is never withheld
         await bus.write_coil("relays", 2, 0, 0)
     responder.silent_units = set()
-    await clock.sleep_until(seconds_ns(40))
+    await clock.sleep_until(to_ns(40))
     assert await read_is_right(bus, 0, unit=2)
     assert await read_is_right(bus, 6, unit=2)
     driver.cancel()
@@ -94,7 +94,7 @@ async def test_unplugged_and_replugged_it_works_again_within_two_seconds(respond
         with pytest.raises(Unreachable, match="rs485"):
             await read_is_right(bus, 100)
     wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
-    await clock.sleep_until(seconds_ns(2))
+    await clock.sleep_until(to_ns(2))
     assert await read_is_right(bus, 100)
     assert bus.counters.lines_down > 0
     driver.cancel()

@@ -15,7 +15,7 @@ from thermostand.drivers.framing.aravis_library import DEVICE_ERRORS, GENICAM_ER
 from thermostand.drivers.wires.camera_errors import device_error
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
 from thermostand.drivers.wires.frame_count import FrameCount
-from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, WallClock, to_ns
 from thermostand.foundation.errors import DeviceError, Refused, Unreachable
 from thermostand.foundation.readings import Quality
 
@@ -144,7 +144,7 @@ async def test_a_due_trigger_waits_for_its_instant_with_everything_prepared():
     async with Opened() as camera:
         due_ns = WallClock().now_ns() + NS_PER_S // 5
         frame = await camera.grab(due_ns=due_ns)
-        assert 0 <= frame.time_ns - seconds_ns(EXPOSURE_S / 2) - due_ns < NS_PER_S // 10
+        assert 0 <= frame.time_ns - to_ns(EXPOSURE_S / 2) - due_ns < NS_PER_S // 10
 
 
 async def test_an_exposure_holds_for_one_frame():

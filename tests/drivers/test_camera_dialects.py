@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.addresses import usual_camera_address
+from tests.addresses import get_usual_camera_address
 from tests.dialects import (
     DIALECTS,
     EXPOSURE,
@@ -65,7 +65,7 @@ def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)
         StillPlant(0, sensor=41.5, body=33.0),
         WallClock(),
         render,
-        usual_camera_address(),
+        get_usual_camera_address(),
         "SN1",
         size_px=size_px,
         real_time=True,
@@ -81,7 +81,7 @@ def dressed(file: GenicamFile | None, size_px: tuple[int, int] = (WIDTH, HEIGHT)
 
 @asynccontextmanager
 async def opened(**changes: object):
-    usual = {"address": usual_camera_address(), "exposure_s": 0.01, "packet_size": 1500}
+    usual = {"address": get_usual_camera_address(), "exposure_s": 0.01, "packet_size": 1500}
     camera = AravisCamera("eye", GigeCameraSettings.model_validate({**usual, **changes}), WallClock())
     try:
         await camera.open()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermostand.drivers.wires.aravis import unpacked
+from thermostand.drivers.wires.aravis import unpack_pixels
 from thermostand.drivers.wires.camera_settings import PixelFormat, frame_bytes
 
 # 0x123 and 0xABC of 12 bits, 0x123 and 0x2BC of 10, as the standards draw them.
@@ -22,7 +22,7 @@ LAYOUTS: list[tuple[PixelFormat, str, list[int]]] = [
 @pytest.mark.parametrize(("pixel_format", "data", "pixels"), LAYOUTS, ids=[layout[0] for layout in LAYOUTS])
 def test_each_layout_gives_the_cameras_own_values(pixel_format: PixelFormat, data: str, pixels: list[int]):
     raw = np.frombuffer(bytes.fromhex(data), np.uint8)
-    image = unpacked(pixel_format, raw, (1, len(pixels)))
+    image = unpack_pixels(pixel_format, raw, (1, len(pixels)))
     assert image.tolist() == [pixels]
     assert image.dtype == (np.uint8 if pixel_format == "Mono8" else np.uint16)
     assert frame_bytes(pixel_format, len(pixels)) == len(raw)
@@ -41,5 +41,5 @@ def test_each_layout_gives_the_cameras_own_values(pixel_format: PixelFormat, dat
 )
 def test_an_odd_count_of_pixels_ends_within_a_group(pixel_format: PixelFormat, count: int, size: int):
     assert frame_bytes(pixel_format, count) == size
-    image = unpacked(pixel_format, np.full(size, 0xFF, np.uint8), (1, count))
+    image = unpack_pixels(pixel_format, np.full(size, 0xFF, np.uint8), (1, count))
     assert image.shape == (1, count)

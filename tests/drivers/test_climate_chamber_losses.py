@@ -9,7 +9,7 @@ import pytest
 
 from tests.drivers.chamber_bench import ALLOWED_DEGC, MAKES, ON_WIRES, WIRES, bench_of, running_at_30_degC
 from thermostand.drivers.devices.chambers.chamber_ascii2 import number, parse
-from thermostand.drivers.devices.chambers.chamber_cts import framed, unframed
+from thermostand.drivers.devices.chambers.chamber_cts import unwrap_frame, wrap_frame
 from thermostand.foundation.errors import DeviceError, DeviceFault, Refused, Unreachable
 from thermostand.foundation.readings import Quality
 
@@ -247,8 +247,8 @@ async def test_a_quick_timer_that_is_not_renewed_ends_the_heat(tmp_path: Path):
     ],
 )
 def test_a_cts_frame_is_that_of_the_manual(text: str, frame: str):
-    assert framed(1, text) == bytes.fromhex(frame)
-    assert unframed(1, bytes.fromhex(frame)) == text
+    assert wrap_frame(1, text) == bytes.fromhex(frame)
+    assert unwrap_frame(1, bytes.fromhex(frame)) == text
 
 
 def test_an_ascii_2_reply_is_read_whole_in_pieces_and_not_beside_it():

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.drivers.chamber_bench import MAKES, ON_WIRES, bench_of, running_at_30_degC
-from thermostand.drivers.devices.chambers.chamber_simserv import reply_of
+from thermostand.drivers.devices.chambers.chamber_simserv import parse_reply
 from thermostand.foundation.clock import VirtualClock, WallClock
 from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused
 
@@ -242,7 +242,7 @@ async def test_a_circulator_with_one_working_temperature_says_so_once_and_is_use
         found = await bench.driver.in_force()
         assert "in_mode_04" in found.known_by
         assert "in_mode_01" not in found.known_by
-        assert "which working temperature acts" in found.not_told
+        assert "which working temperature acts" in found.not_reported
         bench.fake.external = True
         assert (await bench.read())["fault"].value == 1
 
@@ -257,12 +257,12 @@ async def test_a_gradient_that_is_wanted_and_one_that_a_unit_does_not_know_are_n
 
 
 async def test_a_temperature_that_looks_like_a_code_is_a_temperature(tmp_path: Path):
-    assert reply_of(b"1\xb6-5\r\n") == ("1", ["-5"])
-    assert reply_of(b"-5\r\n") == ("-5", [])
-    assert [reply_of(b"1\xb624.98\r\n"[:length]) for length in range(8)] == [None] * 8
+    assert parse_reply(b"1\xb6-5\r\n") == ("1", ["-5"])
+    assert parse_reply(b"-5\r\n") == ("-5", [])
+    assert [parse_reply(b"1\xb624.98\r\n"[:length]) for length in range(8)] == [None] * 8
     for wrong in (b"24.98\r\n", b"-5\xb61\r\n", b"\r\n"):
         with pytest.raises(ValueError, match="expected"):
-            reply_of(wrong)
+            parse_reply(wrong)
     async with bench_of("simserv", "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.stuck_degC = -5.0

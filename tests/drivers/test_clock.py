@@ -12,9 +12,9 @@ from thermostand.foundation.clock import (
     VirtualClock,
     WallClock,
     block_until,
-    boot_of,
     boot_time_ns,
-    seconds_ns,
+    get_boot,
+    to_ns,
 )
 from thermostand.foundation.errors import Unreachable
 
@@ -140,14 +140,14 @@ def test_sleepers_with_any_deadlines_wake_sorted_and_ties_keep_their_order(deadl
 async def test_the_wall_clock_never_goes_back_and_sleeps_to_a_deadline():
     clock = WallClock()
     before_ns = clock.now_ns()
-    await clock.sleep_until(before_ns + seconds_ns(0.001))
-    assert clock.now_ns() >= before_ns + seconds_ns(0.001)
+    await clock.sleep_until(before_ns + to_ns(0.001))
+    assert clock.now_ns() >= before_ns + to_ns(0.001)
     await clock.sleep_until(0)  # a past deadline returns
 
 
 def test_a_thread_waits_for_an_instant_but_never_for_virtual_time():
     clock = WallClock()
-    due_ns = clock.now_ns() + seconds_ns(0.005)
+    due_ns = clock.now_ns() + to_ns(0.005)
     block_until(clock, due_ns)
     assert clock.now_ns() >= due_ns
     block_until(VirtualClock(5), 5)
@@ -168,12 +168,12 @@ def test_the_time_of_a_suspend_has_passed_and_a_step_of_the_system_clock_has_not
     clock = host.clock()
     begin_ns = clock.now_ns()
     assert begin_ns == host.utc_ns()
-    host.suspended_ns += seconds_ns(40)
-    assert clock.now_ns() == host.utc_ns() == begin_ns + seconds_ns(40)
-    assert (clock.suspended_ns(), clock.utc_offset_ns()) == (seconds_ns(40), 0)
+    host.suspended_ns += to_ns(40)
+    assert clock.now_ns() == host.utc_ns() == begin_ns + to_ns(40)
+    assert (clock.suspended_ns(), clock.utc_offset_ns()) == (to_ns(40), 0)
     host.step(-3600)
-    assert clock.now_ns() == begin_ns + seconds_ns(40)
-    assert clock.utc_offset_ns() == seconds_ns(-3600)
+    assert clock.now_ns() == begin_ns + to_ns(40)
+    assert clock.utc_offset_ns() == to_ns(-3600)
 
 
 def test_a_clock_begins_no_earlier_than_the_one_before_it_ended():
@@ -182,7 +182,7 @@ def test_a_clock_begins_no_earlier_than_the_one_before_it_ended():
     host.step(-3600)
     clock = host.clock(reached_ns + 1)
     assert clock.now_ns() == reached_ns + 1
-    assert clock.utc_offset_ns() == seconds_ns(-3600) - 1
+    assert clock.utc_offset_ns() == to_ns(-3600) - 1
     host.step(7200)
     assert host.clock(reached_ns).utc_offset_ns() == 0
 
@@ -191,17 +191,17 @@ def test_an_instant_is_found_again_by_its_boot_time_whatever_the_system_clock_sa
     host = Host()
     before = host.clock()
     off_ns = before.boot.time_ns(before.now_ns())
-    host.awake_ns += seconds_ns(23)
+    host.awake_ns += to_ns(23)
     host.step(3600)
     after = host.clock()
     assert after.boot.id == before.boot.id
-    assert after.now_ns() - after.boot.stand_ns(off_ns) == seconds_ns(23)
-    assert boot_of(after) is after.boot
-    assert boot_of(VirtualClock(0)) is None
+    assert after.now_ns() - after.boot.stand_ns(off_ns) == to_ns(23)
+    assert get_boot(after) is after.boot
+    assert get_boot(VirtualClock(0)) is None
 
 
 def test_a_process_that_is_kept_from_running_between_two_clocks_looks_again():
-    host, late_ns = Host(), [0, 0, seconds_ns(5), 0, 0, 0]
+    host, late_ns = Host(), [0, 0, to_ns(5), 0, 0, 0]
 
     def utc_ns() -> int:
         host.awake_ns += late_ns.pop() if late_ns else 0  # stopped just before the system clock is read ...
@@ -220,15 +220,15 @@ async def test_a_sleeper_is_late_by_no_more_than_a_second_after_a_suspend(monkey
 
     async def pass_awake(piece_s: float) -> None:
         pieces_s.append(piece_s)
-        host.awake_ns += seconds_ns(piece_s)
-        host.suspended_ns += seconds_ns(40) if len(pieces_s) == 3 else 0
+        host.awake_ns += to_ns(piece_s)
+        host.suspended_ns += to_ns(40) if len(pieces_s) == 3 else 0
 
     clock = host.clock()
-    due_ns = clock.now_ns() + seconds_ns(30)
+    due_ns = clock.now_ns() + to_ns(30)
     monkeypatch.setattr("thermostand.foundation.clock.asyncio.sleep", pass_awake)
     await clock.sleep_until(due_ns)
     assert pieces_s == [0, 1, 1]
-    assert clock.now_ns() == due_ns + seconds_ns(12)
+    assert clock.now_ns() == due_ns + to_ns(12)
 
 
 def test_a_thread_that_waits_is_late_by_no_more_than_a_second_after_a_suspend(monkeypatch: pytest.MonkeyPatch):
@@ -236,18 +236,18 @@ def test_a_thread_that_waits_is_late_by_no_more_than_a_second_after_a_suspend(mo
 
     def pass_awake(piece_s: float) -> None:
         pieces_s.append(piece_s)
-        host.suspended_ns += seconds_ns(40)
+        host.suspended_ns += to_ns(40)
 
     monkeypatch.setattr("thermostand.foundation.clock.time.sleep", pass_awake)
     clock = host.clock()
-    block_until(clock, clock.now_ns() + seconds_ns(30))
+    block_until(clock, clock.now_ns() + to_ns(30))
     assert pieces_s == [1]
 
 
 def test_boot_time_is_that_of_the_kernel():
     before_ns = boot_time_ns()
-    uptime_ns = seconds_ns(float(Path("/proc/uptime").read_text().split()[0]))
-    assert before_ns - seconds_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is given to 10 ms
+    uptime_ns = to_ns(float(Path("/proc/uptime").read_text().split()[0]))
+    assert before_ns - to_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is given to 10 ms
 
 
 async def test_what_sleeps_is_woken_also_when_nobody_can_be_told_of_the_time():

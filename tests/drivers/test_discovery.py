@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Registers
-from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.genicam import make_features
 from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpRequest
-from thermostand.drivers.wires.discovery import GVCP_PORT, FoundCamera, cameras_at, decode_answer, usb_devices
+from thermostand.drivers.wires.discovery import GVCP_PORT, FoundCamera, decode_answer, find_cameras, list_usb_devices
 from thermostand.stand.commands.command_table import app
 
 HERE, SILENT = "127.0.0.91", "127.0.0.92"
@@ -26,7 +26,7 @@ class Device:
 
 
 def channel() -> ControlChannel:
-    return ControlChannel(Registers(features(64, 48, "SN 7"), HERE, "SN 7"), Device())  # pyright: ignore[reportArgumentType]
+    return ControlChannel(Registers(make_features(64, 48, "SN 7"), HERE, "SN 7"), Device())  # pyright: ignore[reportArgumentType]
 
 
 def answer() -> bytes:
@@ -74,10 +74,10 @@ async def test_a_camera_is_found_where_it_is_asked_and_nowhere_else():
     transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
         lambda: camera, local_addr=(HERE, GVCP_PORT)
     )
-    (found,) = await cameras_at([SILENT, HERE], 0.2)
+    (found,) = await find_cameras([SILENT, HERE], 0.2)
     check_camera(found)
     assert camera.asked == 2
-    assert await cameras_at([SILENT], 0.1) == ()
+    assert await find_cameras([SILENT], 0.1) == ()
     transport.close()
 
 
@@ -91,7 +91,7 @@ def test_usb_devices_are_the_kernels_without_hubs(tmp_path: Path):
         (tmp_path / name).mkdir()
         for file, text in texts.items():
             (tmp_path / name / file).write_text(text + "\n")
-    flap, keyboard = usb_devices(tmp_path)
+    flap, keyboard = list_usb_devices(tmp_path)
     assert (flap.vendor, flap.product, flap.serial) == (0x1FFB, 0xC5, "00351210")
     assert "flap" in flap.what
     assert keyboard.what == "Maker Keyboard"

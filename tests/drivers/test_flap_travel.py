@@ -3,7 +3,7 @@
 import pytest
 
 from thermostand.drivers.devices.motion.flap import Travel
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 
 Look = tuple[float, int, bool]  # s since the target was sent, position, saturated
 
@@ -13,7 +13,7 @@ STILL = [(0.05 * i, 500, True) for i in range(1, 12)]
 
 def judged(looks: list[Look], travel_s: float = 5.0) -> list[str]:
     travel = Travel(3500, 40, travel_s, 500, NS_PER_S)
-    return [travel.look(position, saturated, NS_PER_S + seconds_ns(time_s)) for time_s, position, saturated in looks]
+    return [travel.look(position, saturated, NS_PER_S + to_ns(time_s)) for time_s, position, saturated in looks]
 
 
 def test_a_flap_that_moves_is_not_jammed() -> None:
@@ -48,6 +48,6 @@ def test_a_flap_that_creeps_is_too_slow_after_its_time_of_being_watched() -> Non
 def test_three_looks_within_the_tolerance_are_an_arrival() -> None:
     travel = Travel(3500, 40, 5.0, 3400, 0)
     for count, position in enumerate([3470, 3500, 3450, 3465, 3500, 3540]):
-        assert not travel.arrived
-        travel.look(position, True, seconds_ns(0.05 * (count + 1)))
-    assert travel.arrived
+        assert not travel.has_arrived
+        travel.look(position, True, to_ns(0.05 * (count + 1)))
+    assert travel.has_arrived

@@ -18,16 +18,16 @@ from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError, DeviceFault, Unreachable
 from thermostand.foundation.readings import Quality
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 START_NS = 1_700_000_000_000_000_000
 UNIT = 4
 SETTINGS = HeatModuleSettings(registers="icpdas-m7024", unit=UNIT, channel=1, watchdog_s=5.0)
-MAP = load_register_map(packaged("registers", "icpdas-m7024"))
+MAP = load_register_map(find_packaged("registers", "icpdas-m7024"))
 
 
 class Bench:
@@ -38,7 +38,7 @@ class Bench:
         self.fake = FakeHeatModule(self.plant, self.clock, UNIT, channel=1)
 
     async def wait(self, duration_s: float) -> None:
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
 
     def heater_W(self) -> float:
         with self.plant.lock:
@@ -314,7 +314,7 @@ def test_its_registers_are_those_of_the_fact_sheet_in_driver_and_fake_and_none_p
 
 
 def test_a_module_without_a_watchdog_that_can_be_read_is_refused():
-    text = packaged("registers", "icpdas-m7024").read_text().replace("watchdog_s:", "other_s:")
+    text = find_packaged("registers", "icpdas-m7024").read_text().replace("watchdog_s:", "other_s:")
     bus = Bus("bus", BusSettings(address="tcp:127.0.0.1:1"), VirtualClock(0))
     with pytest.raises(ConfigError, match="has no watchdog_s"):
         HeatModule(ModbusUnit("heat_module", bus, parse_document(text, RegisterMap, "map")), SETTINGS, VirtualClock(0))

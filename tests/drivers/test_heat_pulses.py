@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings, pulse_s
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings, compute_pulse_s
+from thermostand.foundation.clock import FollowedClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Refused
 from thermostand.foundation.readings import Reading
 
@@ -18,7 +18,7 @@ SETTINGS = PulsesSettings(cycle_s=20, min_on_s=1, min_off_s=2)
 def test_over_many_cycles_the_heat_is_the_output(percent: float):
     owed_s, given_s, cycles = 0.0, 0.0, 400
     for _ in range(cycles):
-        on_s, owed_s = pulse_s(percent, owed_s, SETTINGS)
+        on_s, owed_s = compute_pulse_s(percent, owed_s, SETTINGS)
         assert on_s == 0 or SETTINGS.min_on_s <= on_s <= SETTINGS.cycle_s - SETTINGS.min_off_s or on_s == 20
         given_s += on_s
     assert abs(given_s / (cycles * SETTINGS.cycle_s) - percent / 100) < 0.001
@@ -51,7 +51,7 @@ class Board:
 
     async def hold_on(self, channel: str, duration_s: float) -> None:
         self.sent.append(round(duration_s, 3))
-        self.until_ns = self.clock.now_ns() + seconds_ns(duration_s)
+        self.until_ns = self.clock.now_ns() + to_ns(duration_s)
 
 
 async def pulses(*percents: float, every_s: float = 20.0) -> list[float]:
@@ -59,7 +59,7 @@ async def pulses(*percents: float, every_s: float = 20.0) -> list[float]:
     board = Board(clock)
     heat = HeatPulses(board, SETTINGS, clock)
     for number, percent in enumerate(percents):
-        clock.follow(seconds_ns(number * every_s))
+        clock.follow(to_ns(number * every_s))
         await heat.give(percent)
     return board.sent
 
@@ -82,9 +82,9 @@ async def test_a_pulse_at_once_begins_a_cycle():
     board = Board(clock)
     heat = HeatPulses(board, SETTINGS, clock)
     await heat.give(50)
-    clock.follow(seconds_ns(3))
+    clock.follow(to_ns(3))
     await heat.give(0, at_once=True)
-    clock.follow(seconds_ns(7))
+    clock.follow(to_ns(7))
     await heat.give(40, at_once=True)
     assert board.sent == [10, 0, 8]
 
@@ -99,11 +99,11 @@ async def test_a_relay_that_is_not_as_it_was_left_is_switched_off_and_reported(p
     heat = HeatPulses(board, SETTINGS, clock)
     await heat.give(percent)
     board.forced = forced
-    clock.follow(seconds_ns(20))
+    clock.follow(to_ns(20))
     with pytest.raises(DeviceFault, match=text):
         await heat.give(percent)
     assert board.sent[-1] == 0
-    clock.follow(seconds_ns(40))
+    clock.follow(to_ns(40))
     await heat.give(percent)
     assert board.sent[-1] > 0
 

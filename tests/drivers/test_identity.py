@@ -11,7 +11,7 @@ import yaml
 from thermostand.drivers.devices.inputs import Inputs
 from thermostand.drivers.devices.relays import Relays
 from thermostand.drivers.devices.thermometers import Thermometers, ThermometerSettings
-from thermostand.drivers.settings import Identity, same_device
+from thermostand.drivers.settings import Identity, check_same_device
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import TcpEngine
 from thermostand.drivers.sim.units.relays import FakeRelays
@@ -113,9 +113,9 @@ async def test_contacts_of_a_board_exchanged_while_it_was_silent_are_not_read(be
     ],
 )
 def test_another_device_is_recognised_by_what_both_state(found: Identity, is_same: bool) -> None:
-    assert same_device("camera", found, None) == found
+    assert check_same_device("camera", found, None) == found
     if is_same:
-        assert same_device("camera", found, A) == found
+        assert check_same_device("camera", found, A) == found
     else:
         with pytest.raises(DeviceFault, match=r"exchanged: .* Make M, serial number 1, version 2\.00"):
-            same_device("camera", found, A)
+            check_same_device("camera", found, A)

@@ -8,17 +8,17 @@ from collections.abc import Callable
 
 import pytest
 
-from thermostand.foundation.calls import Lane, Line, answer_all
 from thermostand.foundation.clock import Clock, VirtualClock, WallClock
+from thermostand.foundation.workers import WorkerConnection, WorkerThread, answer_all
 
 
 @pytest.fixture(params=[WallClock(), VirtualClock(0)], ids=["real", "virtual"])
-def lane(request: pytest.FixtureRequest) -> Lane:
+def lane(request: pytest.FixtureRequest) -> WorkerThread:
     clock: Clock = request.param
-    return Lane("test", clock)
+    return WorkerThread("test", clock)
 
 
-async def test_a_lane_runs_calls_in_order_and_passes_exceptions_on(lane: Lane):
+async def test_a_lane_runs_calls_in_order_and_passes_exceptions_on(lane: WorkerThread):
     order: list[int] = []
     await asyncio.gather(*(lane.call(order.append, number) for number in range(10)))
     assert order == list(range(10))
@@ -29,14 +29,14 @@ async def test_a_lane_runs_calls_in_order_and_passes_exceptions_on(lane: Lane):
 
 
 async def test_real_time_keeps_the_loop_free_and_virtual_time_needs_no_thread():
-    real, virtual = Lane("test", WallClock()), Lane("test", VirtualClock(0))
+    real, virtual = WorkerThread("test", WallClock()), WorkerThread("test", VirtualClock(0))
     assert await real.call(threading.get_ident) != threading.get_ident()
     assert await virtual.call(threading.get_ident) == threading.get_ident()
     real.close()
 
 
 async def test_a_cancelled_caller_waits_until_its_call_has_ended():
-    lane = Lane("test", WallClock())
+    lane = WorkerThread("test", WallClock())
     begun, release, ended = threading.Event(), threading.Event(), threading.Event()
 
     def transaction() -> None:
@@ -57,7 +57,7 @@ async def test_a_cancelled_caller_waits_until_its_call_has_ended():
 
 
 async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goes_on():
-    lane = Lane("test", WallClock(), patient=False)
+    lane = WorkerThread("test", WallClock(), patient=False)
     begun, release, ended = threading.Event(), threading.Event(), threading.Event()
 
     def commit() -> None:
@@ -85,10 +85,10 @@ async def test_where_nothing_bounds_a_call_its_caller_may_leave_and_the_call_goe
 HANGS = """
 import asyncio, threading
 from thermostand.foundation.clock import WallClock
-from thermostand.foundation.calls import Lane, Line, answer_all
+from thermostand.foundation.workers import WorkerThread, WorkerConnection, answer_all
 
 async def main():
-    asyncio.create_task(Lane("hangs", WallClock(), patient=False).call(threading.Event().wait))
+    asyncio.create_task(WorkerThread("hangs", WallClock(), patient=False).call(threading.Event().wait))
     await asyncio.sleep(0.05)
 
 asyncio.run(main())
@@ -102,9 +102,9 @@ def test_a_call_that_never_ends_does_not_keep_the_process_from_its_end():
 async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the_loop_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    monkeypatch.setattr("thermostand.foundation.calls._BEGIN_LIMIT_S", 0.01)
+    monkeypatch.setattr("thermostand.foundation.workers._BEGIN_LIMIT_S", 0.01)
     monkeypatch.setattr("_thread.start_new_thread", lambda function, args: 0)  # it ends before its first step
-    died = Lane("disk", WallClock())
+    died = WorkerThread("disk", WallClock())
     with pytest.raises(MemoryError, match="the thread of disk"):
         await died.call(int)
 
@@ -113,7 +113,7 @@ async def test_a_thread_that_memory_does_not_suffice_for_fails_its_calls_and_the
 
     monkeypatch.setattr("_thread.start_new_thread", refuse)
     with pytest.raises(MemoryError, match="no thread for bus"):
-        await Lane("bus", WallClock()).call(int)
+        await WorkerThread("bus", WallClock()).call(int)
     monkeypatch.undo()
     assert await died.call(int) == 0
     died.close()
@@ -145,7 +145,7 @@ def test_what_cannot_be_handed_over_is_answered_and_the_line_lives(
     ours, theirs = socket.socketpair()
     serving = threading.Thread(target=answer_all, args=(theirs, {}), daemon=True)
     serving.start()
-    line = Line(ours, "the process has ended")
+    line = WorkerConnection(ours, "the process has ended")
     with pytest.raises(OSError, match=f"another process failed .{why}"):
         line.run(function, argument)
     assert line.run(len, "abc") == 3

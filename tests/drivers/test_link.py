@@ -11,7 +11,7 @@ import pytest
 
 from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
 from thermostand.drivers.wires.link import ByteLink, SerialSettings, open_link
-from thermostand.foundation.addresses import state_as
+from thermostand.foundation.addresses import set_display_address
 from thermostand.foundation.errors import Unreachable
 
 LINE = SerialSettings(baud=115200, stopbits=2)
@@ -99,7 +99,7 @@ def test_a_second_opener_of_a_serial_port_learns_that_it_is_taken(tmp_path: Path
 def test_a_simulated_port_is_named_as_the_stands_file_does(tmp_path: Path, stated: str) -> None:
     how, _, name = stated.partition(":")
     free = {"serial": f"serial:{tmp_path / 'anywhere'}", "tcp": "tcp:127.0.0.1:1"}[how]
-    state_as(free, stated)
+    set_display_address(free, stated)
     with pytest.raises(Unreachable) as caught:
         open_link("stage", free, LINE)
     assert name in str(caught.value)

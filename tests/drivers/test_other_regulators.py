@@ -16,11 +16,11 @@ from thermostand.drivers.sim.units.modbus import TcpEngine
 from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import RegisterMap, load_register_map
-from thermostand.foundation.clock import FollowedClock, WallClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, WallClock, to_ns
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError, DeviceFault, Refused, Unreachable
 from thermostand.foundation.readings import Quality, Reading
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 START_NS = 1_700_000_000_000_000_000
 Fake = FakeEurotherm | FakeEzZone | FakeF4t | FakeBinder
@@ -45,7 +45,7 @@ class Bench:
             self.fake.comms_unit = DEGC
 
     def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        self.clock.follow(self.clock.now_ns() + to_ns(duration_s))
         self.fake.handle(b"\x03\x00\x01\x00\x01")
 
 
@@ -62,7 +62,7 @@ async def driven(bench: Bench, register_map: RegisterMap) -> AsyncGenerator[Regu
 
 
 def map_of(make: str, change: Callable[[str], str] = lambda text: text) -> RegisterMap:
-    return parse_document(change(packaged("registers", make).read_text()), RegisterMap, make)
+    return parse_document(change(find_packaged("registers", make).read_text()), RegisterMap, make)
 
 
 def by_name(readings: tuple[Reading, ...]) -> dict[str, Reading]:
@@ -80,7 +80,7 @@ async def test_another_make_heats_to_its_set_point_and_stops(make: str):
         await regulator.run()
         for _ in range(360):
             bench.wait(5.0)
-            if bench.plant.now_ns % seconds_ns(60) == 0:
+            if bench.plant.now_ns % to_ns(60) == 0:
                 await regulator.read()
             elif make == "eurotherm-3200":
                 await regulator.read()  # which refreshes its remote set point
@@ -191,7 +191,7 @@ async def test_a_set_point_that_is_not_the_one_that_acts_stops_what_was_started(
         await regulator.stop()
         await regulator.set_temperature(30.0)
         found = await regulator.in_force()
-        assert (found.objections, bool(found.known_by), bool(found.not_told)) == ((), True, True)
+        assert (found.objections, bool(found.known_by), bool(found.not_reported)) == ((), True, True)
         setattr(bench.fake, name, value)
         bench.wait(5.0)
         with pytest.raises(DeviceFault, match="not in force: "):
@@ -217,7 +217,7 @@ async def test_a_map_that_does_not_say_what_is_in_force_is_known_as_such():
         await regulator.open()
         found = await regulator.in_force()
         assert found.known_by == ""
-        assert "in_force" in found.not_told
+        assert "in_force" in found.not_reported
 
 
 async def test_eurotherm_sensor_break_makes_the_pv_bad():
@@ -271,7 +271,7 @@ def test_floats_are_those_of_the_manuals():
 
 
 def test_the_generic_map_shows_every_kind_of_entry_and_loads():
-    register_map = load_register_map(packaged("registers", "generic-modbus"))
+    register_map = load_register_map(find_packaged("registers", "generic-modbus"))
     assert [len(command.steps) for command in register_map.commands.values()] == [1, 2]
 
 
@@ -285,14 +285,14 @@ def test_the_generic_map_shows_every_kind_of_entry_and_loads():
     ],
 )
 def test_a_command_that_is_none_is_refused(change: dict[str, object], complaint: str):
-    data = yaml.safe_load(packaged("registers", "generic-modbus").read_text())
+    data = yaml.safe_load(find_packaged("registers", "generic-modbus").read_text())
     data["commands"]["stop"] |= change
     with pytest.raises(ConfigError, match=complaint):
         parse_document(yaml.safe_dump(data), RegisterMap, "generic")
 
 
 async def test_what_confirms_a_command_has_to_be_read_at_each_poll(tmp_path: Path):
-    data = yaml.safe_load(packaged("registers", "watlow-f4t").read_text())
+    data = yaml.safe_load(find_packaged("registers", "watlow-f4t").read_text())
     del data["points"]["mode"]["poll"]
     bench = Bench("watlow-f4t")
     with pytest.raises(ConfigError, match=r"mode, .* needs poll: fast"):

@@ -74,7 +74,7 @@ def test_a_new_set_point_makes_no_jump_when_it_is_approached():
 def test_after_a_gap_the_integral_is_as_it_was_and_the_derivative_does_not_kick():
     law = PLAIN.model_copy(update={"derivative_s": 20.0})
     state = pid.State(30.0, 15.0, 3.0, 29.0)
-    output, _ = pid.step(law, pid.continued(law, state, 25.0), 30.0, 25.0, 5.0)
+    output, _ = pid.step(law, pid.continue_after_gap(law, state, 25.0), 30.0, 25.0, 5.0)
     assert output == pytest.approx(10 * (30 - 25) + 15.0)
 
 

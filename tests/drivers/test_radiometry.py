@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, is_whole, parse
-from thermostand.drivers.devices.imager.radiometry import Air, temperatures_degC
-from thermostand.drivers.sim.units.thermal_imager import HEIGHT, WIDTH, RadiometricShot, jpeg_of
+from thermostand.drivers.devices.imager.radiometry import Air, compute_temperatures_degC
+from thermostand.drivers.sim.units.thermal_imager import HEIGHT, WIDTH, RadiometricShot, make_jpeg
 
 SCENE_DEGC = np.linspace(-15.0, 75.0, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
 SPOTS = {"lens": (80, 60), "housing": (40, 30), "back": (120, 90)}
@@ -40,8 +40,8 @@ def test_constants_that_no_camera_has_have_no_transmission() -> None:
 @pytest.mark.parametrize("png", [False, True])
 @pytest.mark.parametrize("emissivity", [1.0, 0.95, 0.5])
 def test_what_was_written_is_read_to_half_a_count(png: bool, emissivity: float) -> None:
-    image = parse(jpeg_of(RadiometricShot(SCENE_DEGC, 1.7e9 + 0.25, spots=SPOTS, png=png, emissivity=emissivity)))
-    found = temperatures_degC(image.counts, image.planck, image.around, emissivity)
+    image = parse(make_jpeg(RadiometricShot(SCENE_DEGC, 1.7e9 + 0.25, spots=SPOTS, png=png, emissivity=emissivity)))
+    found = compute_temperatures_degC(image.counts, image.planck, image.around, emissivity)
     assert np.abs(found - SCENE_DEGC).max() < 0.006 / emissivity
     assert (image.model, image.serial_number, image.camera_s) == ("FLIR E40", "49001234", 1.7e9 + 0.25)
     assert image.spots == SPOTS
@@ -51,10 +51,10 @@ def test_what_was_written_is_read_to_half_a_count(png: bool, emissivity: float) 
 @pytest.mark.parametrize("png", [False, True])
 @pytest.mark.parametrize("emissivity", [0.95, 0.6])
 def test_another_reader_finds_the_same_temperatures(png: bool, emissivity: float, tmp_path: Path) -> None:
-    data = with_air(jpeg_of(RadiometricShot(SCENE_DEGC, 1.7e9, spots=SPOTS, png=png)))
+    data = with_air(make_jpeg(RadiometricShot(SCENE_DEGC, 1.7e9, spots=SPOTS, png=png)))
     (tmp_path / "one.jpg").write_bytes(data)
     image = parse(data)
-    ours = temperatures_degC(image.counts, image.planck, image.around, emissivity)
+    ours = compute_temperatures_degC(image.counts, image.planck, image.around, emissivity)
     peer = flyr.unpack(str(tmp_path / "one.jpg"))
     assert np.abs(ours - peer.adjust_metadata(emissivity=emissivity).celsius).max() < 0.002
     assert np.abs(ours - SCENE_DEGC).max() > 1.0  # the air and the window do matter
@@ -63,21 +63,21 @@ def test_another_reader_finds_the_same_temperatures(png: bool, emissivity: float
 
 def test_a_picture_of_two_segments_is_put_together(tmp_path: Path) -> None:
     large = np.tile(SCENE_DEGC, (2, 2))
-    data = jpeg_of(RadiometricShot(large, 1.7e9))
+    data = make_jpeg(RadiometricShot(large, 1.7e9))
     assert data.count(b"FLIR\0\x01") == 3
     image = parse(data)
-    assert np.abs(temperatures_degC(image.counts, image.planck, image.around, 1.0) - large).max() < 0.006
+    assert np.abs(compute_temperatures_degC(image.counts, image.planck, image.around, 1.0) - large).max() < 0.006
 
 
 def test_a_temperature_without_answer_is_nan() -> None:
-    image = parse(jpeg_of(RadiometricShot(SCENE_DEGC, 0.0)))
+    image = parse(make_jpeg(RadiometricShot(SCENE_DEGC, 0.0)))
     dark = np.array([[0, 1]], np.uint16)
-    assert np.isnan(temperatures_degC(dark, image.planck, image.around, 0.05)).all()
+    assert np.isnan(compute_temperatures_degC(dark, image.planck, image.around, 0.05)).all()
 
 
 def test_counts_in_the_other_byte_order_and_a_tool_that_is_none_are_read_as_such() -> None:
     """As the fact sheet has them: subtype 1 is big endian, by its header; tool 7 is unused."""
-    data = jpeg_of(RadiometricShot(SCENE_DEGC, 0.0, spots=SPOTS))
+    data = make_jpeg(RadiometricShot(SCENE_DEGC, 0.0, spots=SPOTS))
     little, sound = struct.pack("<9H", 2, WIDTH, HEIGHT, 0, 0, 0, WIDTH - 1, 0, HEIGHT - 1), parse(data)
     begin = data.index(little)
     end = begin + 32 + 2 * WIDTH * HEIGHT
@@ -110,14 +110,14 @@ def one_segment_twice(data: bytes) -> bytes:
 )
 def test_what_is_none_is_refused_with_the_reason(damage, why: str) -> None:
     with pytest.raises(NotRadiometric, match=why):
-        parse(damage(jpeg_of(RadiometricShot(SCENE_DEGC, 0.0))))
+        parse(damage(make_jpeg(RadiometricShot(SCENE_DEGC, 0.0))))
 
 
 def test_a_damaged_one_is_refused_and_a_cut_one_is_not_whole() -> None:
     shot = RadiometricShot(SCENE_DEGC, 0.0)
     with pytest.raises(NotRadiometric, match="ends behind the block"):
-        parse(jpeg_of(shot, is_damaged=True))
-    data = jpeg_of(shot)
+        parse(make_jpeg(shot, is_damaged=True))
+    data = make_jpeg(shot)
     assert is_whole(data)
     assert is_whole(data + bytes(512))
     assert not is_whole(data[:-3])

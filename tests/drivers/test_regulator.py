@@ -13,7 +13,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from thermostand.drivers.devices.regulators.regulator import Regulator
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import load_register_map
-from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.clock import WallClock, to_ns
 from thermostand.foundation.errors import ConfigError, DeviceFault, Occupied, Refused, Unreachable
 from thermostand.foundation.readings import Quality, Reading
 
@@ -250,7 +250,7 @@ async def test_the_decimal_point_is_looked_at_again_every_thirty_seconds(
     await regulator.open()
     unit.words[DECIMAL_POINT] = 0
     await regulator.read()
-    clock.ahead_ns = seconds_ns(31)
+    clock.ahead_ns = to_ns(31)
     with pytest.raises(DeviceFault, match="decimal_point"):
         await regulator.read()
 

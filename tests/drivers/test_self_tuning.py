@@ -14,9 +14,9 @@ from thermostand.drivers.sim.units.regulator import FakeRegulator
 from thermostand.drivers.sim.wire import LinkFaults, TcpWire
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.registers import load_register_map
-from thermostand.foundation.clock import FollowedClock, WallClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, WallClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Occupied
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 START_NS = 1_700_000_000_000_000_000
 CONSTANTS = (0x2A00, 0x2A01, 0x2A02)  # proportional band, integral and derivative time of the heat
@@ -35,7 +35,7 @@ async def driven() -> AsyncGenerator[tuple[Plant, FollowedClock, FakeRegulator, 
             plant,
             clock,
             fake,
-            Regulator("regulator", bus, load_register_map(packaged("registers", "omron-e5cc")), WallClock()),
+            Regulator("regulator", bus, load_register_map(find_packaged("registers", "omron-e5cc")), WallClock()),
         )
     finally:
         await bus.close()
@@ -49,7 +49,7 @@ async def test_a_set_point_that_is_not_the_internal_one_is_a_fault_and_is_stoppe
     async with driven() as (plant, clock, fake, regulator):
         await regulator.set_temperature(30.0)
         await regulator.run()
-        clock.follow(clock.now_ns() + seconds_ns(3600))
+        clock.follow(clock.now_ns() + to_ns(3600))
         found = {each.channel: each for each in await regulator.read()}
         assert found["regulator.fault"].value == 0
         setattr(fake, name, value)
@@ -57,7 +57,7 @@ async def test_a_set_point_that_is_not_the_internal_one_is_a_fault_and_is_stoppe
         await regulator.set_temperature(40.0)
         with pytest.raises(DeviceFault, match="another set-point acts"):
             await regulator.run()
-        clock.follow(clock.now_ns() + seconds_ns(60))
+        clock.follow(clock.now_ns() + to_ns(60))
         found = {each.channel: each for each in await regulator.read()}
         assert (found["regulator.running"].value, plant.heater_on_fraction) == (0, 0)
 
@@ -70,7 +70,7 @@ async def test_a_real_self_tuning_takes_no_set_point_ends_by_itself_and_holds_be
             return int.from_bytes(reply[2:], "big")
 
         async def pass_s(duration_s: float) -> dict[str, float | str]:
-            clock.follow(clock.now_ns() + seconds_ns(duration_s))
+            clock.follow(clock.now_ns() + to_ns(duration_s))
             found = {each.channel.removeprefix("regulator."): each for each in await regulator.read()}
             return {"pv": found["pv"].value, "mv_heat": found["mv_heat"].value, "fault": found["fault"].reason}
 

@@ -9,7 +9,7 @@ import pytest
 from tests.still_plant import StillPlant
 from thermostand.drivers.devices.imager.thermal_imager import SpotSettings, ThermalImager, ThermalImagerSettings
 from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
-from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, to_ns
 from thermostand.foundation.items import Event, Item, Original
 from thermostand.foundation.readings import Quality, Reading
 
@@ -21,7 +21,7 @@ class HandClock(VirtualClock):
     """Virtual time by hand: nothing sleeps here."""
 
     def step(self, duration_s: float) -> None:
-        self._now_ns += seconds_ns(duration_s)
+        self._now_ns += to_ns(duration_s)
 
 
 class Bench:
@@ -67,7 +67,7 @@ async def test_each_picture_gives_its_spots_and_itself(bench: Bench) -> None:
     readings = await bench.wait(40)
     assert {name: round(readings[name].value, 1) for name in SPOTS} == {"lens": 41.0, "housing": 48.0, "back": 45.0}
     assert all(reading.quality is Quality.GOOD for reading in readings.values())
-    assert bench.clock.now_ns() - readings["lens"].time_ns < seconds_ns(40)
+    assert bench.clock.now_ns() - readings["lens"].time_ns < to_ns(40)
     (original,) = bench.originals()
     assert original.data == (bench.fake.folder / original.name).read_bytes()
     (taken,) = bench.events("picture_taken")
@@ -145,9 +145,9 @@ async def test_the_same_picture_under_a_new_name_counts_once(bench: Bench) -> No
 async def test_a_wrong_clock_is_reported_and_set_right(bench: Bench, ahead_s: float) -> None:
     bench.fake.clock_s = ahead_s
     readings = await bench.wait(80)
-    taken_ns = START_NS + seconds_ns(62.0)
+    taken_ns = START_NS + to_ns(62.0)
     assert readings["clock_offset"].value == pytest.approx(-ahead_s, abs=2.5)
-    assert abs(readings["lens"].time_ns - taken_ns) < seconds_ns(2.5)
+    assert abs(readings["lens"].time_ns - taken_ns) < to_ns(2.5)
     assert bench.events("picture_taken")[0].data["camera_s"] == pytest.approx(taken_ns / NS_PER_S + ahead_s, abs=2.5)
 
 
@@ -162,7 +162,7 @@ async def test_a_clock_that_is_set_back_on_the_way_costs_one_picture_and_is_repo
     readings = await bench.wait(60)
     assert [event.data["by_s"] for event in bench.events("clock_set_back")] == [pytest.approx(back_s, abs=3)]
     assert readings["clock_offset"].value == pytest.approx(back_s, abs=2.5)
-    assert abs(readings["lens"].time_ns - START_NS - seconds_ns(182.0)) < seconds_ns(2.5)
+    assert abs(readings["lens"].time_ns - START_NS - to_ns(182.0)) < to_ns(2.5)
     assert readings["lens"].quality is Quality.GOOD
     await bench.wait(600)
     assert len(bench.events("clock_set_back")) == 1

@@ -22,7 +22,7 @@ from tests.experiments.sequence_steps import (
     places,
     table_positions,
 )
-from thermostand.experiments.calibration import CalibrationGrid, calibration
+from thermostand.experiments.calibration import CalibrationGrid, plan_calibration
 from thermostand.experiments.steps import (
     Capture,
     CheckHome,
@@ -33,8 +33,8 @@ from thermostand.experiments.steps import (
     Soak,
     StopChamber,
 )
-from thermostand.experiments.validation import Validation, validation
-from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.experiments.validation import Validation, plan_validation
+from thermostand.experiments.warm_up import WarmUp, plan_warm_up
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.recipe import Recipe
@@ -75,7 +75,7 @@ def test_any_calibration_sees_every_position_of_its_grid_that_is_not_left_out(
     left_out = data.draw(st.sets(st.sampled_from(sorted(whole)), max_size=len(whole) - 1))
     omitted = [{"linear_mm": linear, "rotary_deg": rotary} for linear, rotary in left_out]
     parameters = CalibrationGrid.model_validate({**grid, "left_out": omitted})
-    steps = list(calibration(parameters))
+    steps = list(plan_calibration(parameters))
     check_order(steps)
     check_ids(steps)
     positions = table_positions(steps, Role.CALIBRATION)
@@ -88,7 +88,7 @@ def test_any_calibration_sees_every_position_of_its_grid_that_is_not_left_out(
 @given(validations)
 def test_any_validation_ends_each_temperature_where_it_began(given_parameters: dict[str, Any]):
     parameters = Validation.model_validate(given_parameters)
-    steps = list(validation(parameters))
+    steps = list(plan_validation(parameters))
     check_order(steps)
     check_ids(steps)
     first = (parameters.positions[0].linear_mm, parameters.positions[0].rotary_deg)
@@ -105,7 +105,7 @@ def test_any_validation_ends_each_temperature_where_it_began(given_parameters: d
 @given(warm_ups)
 def test_any_warm_up_asks_for_what_only_hands_can_do_and_for_nothing_else(given_parameters: dict[str, Any]):
     parameters = WarmUp.model_validate(given_parameters)
-    steps = list(warm_up(parameters))
+    steps = list(plan_warm_up(parameters))
     check_order(steps)
     check_ids(steps)
     assert len(captures(steps, Role.WARM_UP)) == parameters.visits

@@ -16,12 +16,12 @@ from thermostand.experiments.steps import (
     SoakUntilSettled,
     StartChamber,
     StopChamber,
+    estimate_duration_s,
     number_steps,
-    usual_s,
 )
-from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
-from thermostand.experiments.validation import Validation, validation
-from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.experiments.thermal_cycle import ThermalCycle, plan_thermal_cycle
+from thermostand.experiments.validation import Validation, plan_validation
+from thermostand.experiments.warm_up import WarmUp, plan_warm_up
 from thermostand.stand.config.recipe import Recipe
 
 CYCLE = ThermalCycle(set_points_degC=(34.0, 44.0, 24.0), held_out_degC=(34.0,), cycles=2)
@@ -29,7 +29,7 @@ CYCLE = ThermalCycle(set_points_degC=(34.0, 44.0, 24.0), held_out_degC=(34.0,), 
 
 def test_the_flap_is_open_for_captures_only():
     is_open = False
-    for step in thermal_cycle(CYCLE):
+    for step in plan_thermal_cycle(CYCLE):
         match step:
             case OpenFlap():
                 is_open = True
@@ -45,16 +45,16 @@ def test_the_flap_is_open_for_captures_only():
 
 
 def test_a_cycle_visits_every_set_point_with_its_role_and_ends_stopped():
-    captures = [step for step in thermal_cycle(CYCLE) if isinstance(step, Capture)]
+    captures = [step for step in plan_thermal_cycle(CYCLE) if isinstance(step, Capture)]
     assert [(step.chamber_degC, step.role) for step in captures] == [
         (24.0, Role.REFERENCE),
         *[(34.0, Role.VALIDATION), (44.0, Role.FIT), (24.0, Role.FIT)] * 2,
     ]
-    assert isinstance(list(thermal_cycle(CYCLE))[-1], StopChamber)
+    assert isinstance(list(plan_thermal_cycle(CYCLE))[-1], StopChamber)
 
 
 def test_each_dwell_follows_its_set_point():
-    steps = list(thermal_cycle(CYCLE))
+    steps = list(plan_thermal_cycle(CYCLE))
     for before, after in itertools.pairwise(steps):
         if isinstance(before, SetTemperature):
             assert after == Soak(CYCLE.soak_s)
@@ -66,8 +66,8 @@ UNTIL_SETTLED = SoakUntilSettled(2700.0, 600.0, 600.0, 120.0, 0.2, 0.003, 0.1, 3
 def test_a_dwell_until_settled_takes_the_place_of_the_fixed_one_at_its_set_point():
     """The equilibrium, which everything is measured against, stays as it is."""
     cycle = {"set_points_degC": [34], "equilibrium_s": 3000, "soak_s": 2700}
-    fixed = list(thermal_cycle(ThermalCycle.model_validate(cycle)))
-    adaptive = list(thermal_cycle(ThermalCycle.model_validate({**cycle, "until": "settled"})))
+    fixed = list(plan_thermal_cycle(ThermalCycle.model_validate(cycle)))
+    adaptive = list(plan_thermal_cycle(ThermalCycle.model_validate({**cycle, "until": "settled"})))
     assert adaptive == [UNTIL_SETTLED if step == Soak(2700.0) else step for step in fixed]
     assert adaptive.count(UNTIL_SETTLED) == 1
     assert not UNTIL_SETTLED.is_setup
@@ -77,7 +77,9 @@ def test_a_dwell_until_settled_takes_the_place_of_the_fixed_one_at_its_set_point
 def test_a_validation_waits_for_the_camera_too():
     places = [{"linear_mm": 0, "rotary_deg": 0}, {"linear_mm": 9, "rotary_deg": 0}]
     parameters = {"temperatures_degC": [24, 34], "positions": places, "until": {"settled": {"min_s": 900}}}
-    soaks = [step for step in validation(Validation.model_validate(parameters)) if isinstance(step, SoakUntilSettled)]
+    soaks = [
+        step for step in plan_validation(Validation.model_validate(parameters)) if isinstance(step, SoakUntilSettled)
+    ]
     assert soaks == [SoakUntilSettled(2700.0, 900.0, 600.0, 120.0, 0.2, 0.003, 0.1, 34.0)]
 
 
@@ -97,7 +99,7 @@ def test_thresholds_that_cannot_be_are_refused(entries: dict[str, object], messa
 
 
 def test_a_warm_up_powers_the_camera_right_before_the_first_frame():
-    steps = list(warm_up(WarmUp(frames=10)))
+    steps = list(plan_warm_up(WarmUp(frames=10)))
     on = steps.index(PowerCamera(on=True))
     assert isinstance(steps[on + 1], Capture)
     assert isinstance(steps[on - 1], OpenFlap)
@@ -105,20 +107,20 @@ def test_a_warm_up_powers_the_camera_right_before_the_first_frame():
 
 
 def test_ids_follow_place_and_parameters():
-    first = [planned.step_id for planned in number_steps(thermal_cycle(CYCLE))]
-    again = [planned.step_id for planned in number_steps(thermal_cycle(CYCLE))]
+    first = [planned.step_id for planned in number_steps(plan_thermal_cycle(CYCLE))]
+    again = [planned.step_id for planned in number_steps(plan_thermal_cycle(CYCLE))]
     edited = CYCLE.model_copy(update={"set_points_degC": (34.0, 45.0, 24.0)})
-    changed = [planned.step_id for planned in number_steps(thermal_cycle(edited))]
+    changed = [planned.step_id for planned in number_steps(plan_thermal_cycle(edited))]
     assert first == again
     assert len(set(first)) == len(first)
     differing = [index for index, (one, other) in enumerate(zip(first, changed, strict=True)) if one != other]
-    kinds = [type(step) for step in thermal_cycle(edited)]
+    kinds = [type(step) for step in plan_thermal_cycle(edited)]
     assert differing
     assert {kinds[index] for index in differing} == {SetTemperature, Capture}
 
 
 def test_a_capture_lasts_from_its_first_to_its_last_frame():
-    assert usual_s([Capture(5, 0.5, 0.1, Role.FIT, 24.0)]) == pytest.approx(2.1)
+    assert estimate_duration_s([Capture(5, 0.5, 0.1, Role.FIT, 24.0)]) == pytest.approx(2.1)
 
 
 @pytest.mark.parametrize(

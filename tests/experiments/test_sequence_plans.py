@@ -14,7 +14,7 @@ from tests.experiments.sequence_steps import (
     check_order,
     table_positions,
 )
-from thermostand.experiments.calibration import CalibrationGrid, calibration
+from thermostand.experiments.calibration import CalibrationGrid, plan_calibration
 from thermostand.experiments.steps import (
     Capture,
     CheckHome,
@@ -30,14 +30,14 @@ from thermostand.experiments.steps import (
     StartChamber,
     Step,
     StopChamber,
-    usual_s,
+    estimate_duration_s,
 )
-from thermostand.experiments.validation import Validation, validation
-from thermostand.experiments.warm_up import WarmUp, warm_up
+from thermostand.experiments.validation import Validation, plan_validation
+from thermostand.experiments.warm_up import WarmUp, plan_warm_up
 from thermostand.foundation.documents import load_document
 from thermostand.stand.config.recipe import Experiment, Recipe
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.estimate import price
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.estimating.estimate import price_plan
 
 RECIPES = [
     "calibration",
@@ -53,7 +53,7 @@ RECIPES = [
 
 
 def recipe(name: str) -> Recipe:
-    return load_document(packaged("recipes", name), Recipe)
+    return load_document(find_packaged("recipes", name), Recipe)
 
 
 def steps_of(name: str) -> list[Step]:
@@ -64,7 +64,7 @@ def steps_of(name: str) -> list[Step]:
 
 
 def test_every_installed_recipe_is_among_the_tested():
-    assert sorted(path.stem for path in Path(packaged("recipes", "demo")).parent.glob("*.yaml")) == RECIPES
+    assert sorted(path.stem for path in Path(find_packaged("recipes", "demo")).parent.glob("*.yaml")) == RECIPES
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -72,7 +72,7 @@ def test_an_installed_recipe_keeps_the_order_and_fits_both_stands(name: str):
     check_order(steps_of(name))
     check_ids(steps_of(name))
     for stand in ("simulated", "laboratory"):
-        assert price(recipe(name).plan(), load_config(packaged("", stand)))
+        assert price_plan(recipe(name).plan(), load_config(find_packaged("", stand)))
 
 
 def test_the_calibration_sees_34_different_positions_at_the_reference():
@@ -120,7 +120,7 @@ def test_validation_positions_lie_within_the_calibrated_ones():
 
 
 def test_the_night_fits_between_six_in_the_evening_and_eight_in_the_morning():
-    priced = price(recipe("overnight").plan(), load_config(packaged("", "laboratory")))
+    priced = price_plan(recipe("overnight").plan(), load_config(find_packaged("", "laboratory")))
     assert 13.0 < sum(step.duration_s for step in priced) / 3600 < 14.0
 
 
@@ -134,7 +134,7 @@ def test_the_night_meets_each_set_point_in_between_once_from_below_and_once_from
 
 
 def test_the_table_is_moved_before_the_camera_is_switched_on_so_that_nothing_delays_the_first_frame():
-    steps = list(warm_up(WarmUp(table_position={"linear": 5.0})))
+    steps = list(plan_warm_up(WarmUp(table_position={"linear": 5.0})))
     kinds = [type(step) for step in steps]
     assert kinds == [
         CloseFlap,
@@ -174,15 +174,15 @@ def test_set_up_is_restored_after_an_interruption_and_work_is_done_once():
 
 
 def test_a_cool_down_lasts_until_20_K_have_decayed_to_the_band_or_its_limit_is_reached():
-    assert usual_s([CoolDown(0.5, 1200.0, 7200.0)]) == pytest.approx(4426.7, abs=0.1)
-    assert usual_s([CoolDown(0.5, 1200.0, 3600.0)]) == 3600.0
-    assert usual_s([CoolDown(20.0, 1200.0, 3600.0)]) == 0.0
+    assert estimate_duration_s([CoolDown(0.5, 1200.0, 7200.0)]) == pytest.approx(4426.7, abs=0.1)
+    assert estimate_duration_s([CoolDown(0.5, 1200.0, 3600.0)]) == 3600.0
+    assert estimate_duration_s([CoolDown(20.0, 1200.0, 3600.0)]) == 0.0
 
 
 def test_each_kind_of_entry_plans_its_own_steps():
     def steps(entry: dict[str, object]) -> Iterator[Step]:
-        return (written.step for written in Experiment.model_validate(entry).sequence())
+        return (written.step for written in Experiment.model_validate(entry).make_sequence())
 
-    assert list(steps({"calibration": GRID})) == list(calibration(CalibrationGrid.model_validate(GRID)))
-    assert list(steps({"validation": PLACES})) == list(validation(Validation.model_validate(PLACES)))
-    assert list(steps({"warm_up": {}})) == list(warm_up(WarmUp()))
+    assert list(steps({"calibration": GRID})) == list(plan_calibration(CalibrationGrid.model_validate(GRID)))
+    assert list(steps({"validation": PLACES})) == list(plan_validation(Validation.model_validate(PLACES)))
+    assert list(steps({"warm_up": {}})) == list(plan_warm_up(WarmUp()))

@@ -7,6 +7,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thermostand.experiments.recipe_steps import StepEntry
 from thermostand.experiments.steps import (
     Capture,
     CheckHome,
@@ -24,11 +25,10 @@ from thermostand.experiments.steps import (
     Step,
     StopChamber,
 )
-from thermostand.experiments.written import StepEntry
 from thermostand.foundation.documents import load_document, parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 
 def planned(text: str) -> list[Step]:
@@ -176,7 +176,7 @@ PLANS = {
 
 @pytest.mark.parametrize("name", PLANS)
 def test_an_installed_recipe_keeps_its_plan(name: str):
-    ids = ",".join(step.step_id for step in load_document(packaged("recipes", name), Recipe).plan())
+    ids = ",".join(step.step_id for step in load_document(find_packaged("recipes", name), Recipe).plan())
     assert hashlib.sha256(ids.encode()).hexdigest()[:16] == PLANS[name]
 
 

@@ -32,7 +32,7 @@ def demo() -> Any:
         session = product.run(folder / "sessions", "demo")
         product.offline("report", session, "-o", folder / "report.html")
         product.offline("datasheet", session, "-o", folder / "datasheet.json")
-        return product.recorded(session) | _documents(folder, "report.json", "datasheet.json")
+        return product.summarise_session(session) | _documents(folder, "report.json", "datasheet.json")
 
 
 def table() -> Any:
@@ -44,21 +44,21 @@ def table() -> Any:
         product.offline("calibrate", session, "-o", camera)
         product.offline("fit", session, "-o", model)
         product.offline("validate", session, "--camera", camera, "--model", model, "-o", page)
-        return product.recorded(session) | _documents(folder, "camera.json", "model.json", "validation.json")
+        return product.summarise_session(session) | _documents(folder, "camera.json", "model.json", "validation.json")
 
 
 def _documents(folder: Path, *names: str) -> dict[str, Any]:
     return {name: json.loads((folder / name).read_text("utf-8")) for name in names}
 
 
-NIGHTS: dict[str, Callable[[], Any]] = {"demo": demo, "table": table}
+SESSIONS: dict[str, Callable[[], Any]] = {"demo": demo, "table": table}
 OFFERED: dict[str, Callable[[], Any]] = {"openapi": product.openapi, "help": product.helps}
-GOLDENS = NIGHTS | OFFERED
+GOLDENS = SESSIONS | OFFERED
 
 
 def write(name: str, value: Any) -> None:
     """Keep it: a night packed, what is offered as text, a line each."""
-    if name in NIGHTS:
+    if name in SESSIONS:
         packed = gzip.compress(json.dumps(value, sort_keys=True).encode(), 9, mtime=0)
         (DATA / f"{name}.json.gz").write_bytes(packed)
     elif name == "help":
@@ -67,38 +67,38 @@ def write(name: str, value: Any) -> None:
         (DATA / f"{name}.json").write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", "utf-8")
 
 
-def kept(name: str) -> Any:
+def load_golden(name: str) -> Any:
     """What `write` has kept."""
-    if name in NIGHTS:
+    if name in SESSIONS:
         return json.loads(gzip.decompress((DATA / f"{name}.json.gz").read_bytes()))
     if name == "help":
         return dict(part.split("\n", 1) for part in (DATA / "help.txt").read_text("utf-8").split("\f\n"))
     return json.loads((DATA / f"{name}.json").read_text("utf-8"))
 
 
-def differences(kept: Any, now: Any, place: str = "") -> Iterator[str]:
+def find_differences(kept: Any, now: Any, place: str = "") -> Iterator[str]:
     """Each place where they differ, with both. Floats are equal to 1e-9 of their size, or to 1e-12."""
     if isinstance(kept, dict) and isinstance(now, dict):
         before, after = cast("dict[str, Any]", kept), cast("dict[str, Any]", now)
         for key in sorted(before.keys() | after.keys()):
             if key not in after:
-                yield f"{place}/{key}: is gone, was {_short(before[key])}"
+                yield f"{place}/{key}: is gone, was {_shorten(before[key])}"
             elif key not in before:
-                yield f"{place}/{key}: is new, {_short(after[key])}"
+                yield f"{place}/{key}: is new, {_shorten(after[key])}"
             else:
-                yield from differences(before[key], after[key], f"{place}/{key}")
+                yield from find_differences(before[key], after[key], f"{place}/{key}")
     elif isinstance(kept, list) and isinstance(now, list):
         if len(kept) != len(now):
             yield f"{place}: has {len(now)} entries, had {len(kept)}"
         for index, (each, other) in enumerate(zip(kept, now, strict=False)):
-            yield from differences(each, other, f"{place}/{index}")
+            yield from find_differences(each, other, f"{place}/{index}")
     elif isinstance(kept, str) and isinstance(now, str) and "\n" in kept:
-        yield from differences(kept.splitlines(), now.splitlines(), place)
-    elif not _same(kept, now):
-        yield f"{place}: is {_short(now)}, was {_short(kept)}"
+        yield from find_differences(kept.splitlines(), now.splitlines(), place)
+    elif not _is_same(kept, now):
+        yield f"{place}: is {_shorten(now)}, was {_shorten(kept)}"
 
 
-def _same(kept: Any, now: Any) -> bool:
+def _is_same(kept: Any, now: Any) -> bool:
     numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in (kept, now))
     if not numbers or (isinstance(kept, int) and isinstance(now, int)):
         return type(kept) is type(now) and kept == now
@@ -107,12 +107,12 @@ def _same(kept: Any, now: Any) -> bool:
     return math.isclose(kept, now, rel_tol=_RELATIVE, abs_tol=_ABSOLUTE)
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 100 else text[:97] + "..."
 
 
-def as_kept(value: Any) -> Any:
+def round_trip(value: Any) -> Any:
     """As it comes back from the disk: tuples are lists."""
     return json.loads(json.dumps(value))
 
@@ -125,11 +125,11 @@ def main() -> int:
     given = parser.parse_args()
     status = 0
     for name in given.names or (OFFERED if given.what == "make" else GOLDENS):
-        now = as_kept(GOLDENS[name]())
+        now = round_trip(GOLDENS[name]())
         if given.what == "make":
             write(name, now)
             continue
-        found = list(differences(kept(name), now))
+        found = list(find_differences(load_golden(name), now))
         sys.stdout.write(f"{name}: {len(found) or 'no'} differences\n")
         sys.stdout.writelines(f"  {each}\n" for each in found[:_MOST])
         status = status or int(bool(found))

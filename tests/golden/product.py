@@ -21,14 +21,14 @@ import numpy as np
 from typer.main import get_command
 
 import thermostand
-from tests.stand.a_desk import ADesk, served
-from tests.stand.page_desk import TARGET, free_port
+from tests.stand.fake_service import FakeService, serve_fake
+from tests.stand.page_service import TARGET, free_port
 from thermostand.compensation.cli import app as compensate
 from thermostand.stand.commands.command_table import app as stand
-from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.page_room import PageRoom
-from thermostand.stand.serving.viewing import Viewing
+from thermostand.stand.config.stand_config import find_packaged
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.page_data import PageData
+from thermostand.stand.serving.page_routes import PageRoutes
 
 APPS = {"stand": stand, "compensate": compensate}
 _KEPT = 48
@@ -56,7 +56,7 @@ def _do(program: str, *arguments: str | Path) -> None:
         raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}: {done.stderr[-2000:]}")
 
 
-def recorded(path: Path) -> dict[str, Any]:
+def summarise_session(path: Path) -> dict[str, Any]:
     """By value: readings, steps, events and frames of a session. Sums are weighted, so that an exchange shows."""
     session = thermostand.session(path)
     steps = [
@@ -90,7 +90,7 @@ def _column(time_ns: Any, value: Any) -> dict[str, Any]:
 def _frames(session: thermostand.Session) -> Iterator[dict[str, Any]]:
     """Each frame as it was recorded, and where the markers are in it by our own detection."""
     table = session.frames_table()
-    target = thermostand.load_target(packaged("targets", "paper-9x6"))
+    target = thermostand.load_target(find_packaged("targets", "paper-9x6"))
     for row, frame in enumerate(session.frames()):
         facts = {name: column[row].item() for name, column in table.columns().items() if name != "file"}
         try:
@@ -115,9 +115,9 @@ def openapi() -> dict[str, Any]:
 
 async def _document() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
-        desk, port = ADesk(), free_port()
-        rooms = (PageRoom(Viewing(desk.hub, desk.clock, Path(folder), TARGET)),)
-        async with served(desk, Path(folder, "now"), Interface(Path(folder), port=port, rooms=rooms)):
+        desk, port = FakeService(), free_port()
+        rooms = (PageRoutes(PageData(desk.hub, desk.clock, Path(folder), TARGET)),)
+        async with serve_fake(desk, Path(folder, "now"), Interface(Path(folder), port=port, extra_routes=rooms)):
             return json.loads(await asyncio.to_thread(_get, port, "/openapi.json"))
 
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from tests.golden.__main__ import GOLDENS, NIGHTS, OFFERED, as_kept, differences, kept
+from tests.golden.__main__ import GOLDENS, OFFERED, SESSIONS, find_differences, load_golden, round_trip
 
 
-@pytest.mark.parametrize("name", [*OFFERED, *(pytest.param(name, marks=pytest.mark.nightly) for name in NIGHTS)])
+@pytest.mark.parametrize("name", [*OFFERED, *(pytest.param(name, marks=pytest.mark.nightly) for name in SESSIONS)])
 def test_nothing_differs_from_what_is_kept(name: str):
     """Where openapi and help change with a reason: python -m tests.golden make."""
-    assert list(differences(kept(name), as_kept(GOLDENS[name]()))) == []
+    assert list(find_differences(load_golden(name), round_trip(GOLDENS[name]()))) == []
 
 
 @pytest.mark.parametrize(
@@ -28,4 +28,4 @@ def test_nothing_differs_from_what_is_kept(name: str):
     ],
 )
 def test_each_difference_is_said_with_its_place(before: Any, now: Any, places: list[str]):
-    assert [each.partition(":")[0] for each in differences(before, json.loads(json.dumps(now)))] == places
+    assert [each.partition(":")[0] for each in find_differences(before, json.loads(json.dumps(now)))] == places

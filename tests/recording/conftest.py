@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.damage import (
-    fresh,
+    copy_session,
     write_segment,
 )
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
@@ -39,7 +39,7 @@ def damaged(memory, night):
 
     def make(series, change, of="part"):
         directory, written = night
-        folder = fresh(directory, memory / "copy") / series
+        folder = copy_session(directory, memory / "copy") / series
         path = folder / ("0001.mcap.part" if of == "part" else "0000.mcap")
         for part in folder.parent.glob("*/*.part"):
             part.unlink()

@@ -9,21 +9,21 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
-from tests.recording.declared import form as declared_form
-from tests.recording.stored import CAMERA_TOPICS, stored
+from tests.recording.device_declarations import form as declared_form
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.images import frame_topics
-from thermostand.recording.format.journal_lines import text_hash
+from thermostand.recording.format.images import name_frame_topics
+from thermostand.recording.format.journal_lines import hash_text
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, read_manifest
-from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
-from thermostand.recording.writing.forms import readings_topic
+from thermostand.recording.format.records import list_frame_places, read_frame, read_telemetry_messages
 from thermostand.recording.writing.manifest_file import complete_manifest
-from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
+from thermostand.recording.writing.segment import MessageRecord, SeriesSpec, Topic
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import make_readings_topic
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "Zoë"}
@@ -31,7 +31,7 @@ ATTACHMENTS = {"config.yaml": "camera: {gain_dB: 0.0}\n" * 20, "recipe.yaml": "n
 ENCODER = declared_form("thermometers")
 TOPICS = {
     TELEMETRY: (
-        readings_topic(ENCODER),
+        make_readings_topic(ENCODER),
         Topic(messages.EVENT, messages.CLASSES[messages.EVENT]),
     ),
     FRAMES: CAMERA_TOPICS,
@@ -41,7 +41,7 @@ COMPRESSION = {TELEMETRY: CompressionType.ZSTD, FRAMES: CompressionType.ZSTD}
 
 def form(series, metadata=METADATA, attachments=ATTACHMENTS, topics=None, segment_bytes=1 << 40):
     topics = TOPICS[series] if topics is None else topics
-    return SeriesForm(series, topics, COMPRESSION[series], metadata, attachments, segment_bytes, 1 << 60)
+    return SeriesSpec(series, topics, COMPRESSION[series], metadata, attachments, segment_bytes, 1 << 60)
 
 
 def frame(index):
@@ -60,7 +60,7 @@ def telemetry_of(index):
 
 
 def frame_of(index):
-    yield from stored(frame(index))
+    yield from make_frame_records(frame(index))
 
 
 RECORDS_OF = {TELEMETRY: telemetry_of, FRAMES: frame_of}
@@ -126,10 +126,10 @@ def write_segment(folder, series, indices, finish=False, **changes):
 
 def list_segments(directory, changes):
     """The session's manifest, as its recorder would have begun it, with the finished segments."""
-    texts = {name: text_hash(text) for name, text in changes.get("attachments", ATTACHMENTS).items()}
+    texts = {name: hash_text(text) for name, text in changes.get("attachments", ATTACHMENTS).items()}
     if not (directory / MANIFEST_NAME).exists():
         begun = Manifest(changes.get("metadata", METADATA), texts=texts)
-        (directory / MANIFEST_NAME).write_bytes(begun.encoded())
+        (directory / MANIFEST_NAME).write_bytes(begun.encode())
     complete_manifest(directory)
 
 
@@ -138,21 +138,21 @@ def unlist(path):
     directory = path.parent.parent
     listed = read_manifest(directory)
     segments = {name: each for name, each in listed.segments.items() if name != f"{path.parent.name}/{path.name[:9]}"}
-    (directory / MANIFEST_NAME).write_bytes(replace(listed, segments=segments, ended=False).encoded())
+    (directory / MANIFEST_NAME).write_bytes(replace(listed, segments=segments, ended=False).encode())
 
 
 def read_segment(path):
     """The messages of a finished segment, read strictly."""
     if path.parent.name == FRAMES:
-        return [record for place in frame_places(path) for record in records_at(place)]
-    read = list(telemetry_messages(path, lambda channel: True))
+        return [record for place in list_frame_places(path) for record in records_at(place)]
+    read = list(read_telemetry_messages(path, lambda channel: True))
     return [MessageRecord(message.topic, message.time_ns, message.data, message.sequence) for message in read]
 
 
 def records_at(place):
     """The two messages of a recorded frame."""
     topics, frame, stamps = (
-        frame_topics(place.meta.channel),
+        name_frame_topics(place.meta.channel),
         read_frame(place),
         (place.sequence, place.meta.published_ns),
     )
@@ -165,27 +165,27 @@ def names(directory: Path):
     return sorted(str(path.relative_to(directory)) for path in directory.rglob("*") if path.is_file())
 
 
-def truncated(data, offset, _rng):
+def truncate(data, offset, _rng):
     return data[:offset]
 
 
-def zeroed_tail(data, offset, _rng):
+def zero_tail(data, offset, _rng):
     return data[:offset] + bytes(len(data) - offset)
 
 
-def garbage_tail(data, offset, rng):
+def overwrite_tail(data, offset, rng):
     return data[:offset] + rng.randbytes(len(data) - offset)
 
 
-def zeroed_hole(data, offset, _rng):
+def zero_block(data, offset, _rng):
     end = min(len(data), offset + 4096)
     return data[:offset] + bytes(end - offset) + data[end:]
 
 
-DAMAGES = (truncated, zeroed_tail, garbage_tail, zeroed_hole)
+DAMAGES = (truncate, zero_tail, overwrite_tail, zero_block)
 
 
-def fresh(source, target):
+def copy_session(source, target):
     """A copy of the session `source` in place of whatever is at `target`."""
     shutil.rmtree(target, ignore_errors=True)
     return shutil.copytree(source, target)

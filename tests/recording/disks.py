@@ -25,7 +25,7 @@ def require(*programs: str) -> None:
 
 
 @contextmanager
-def mounted(folder: Path, *arguments: str | Path) -> Iterator[Path]:
+def mount(folder: Path, *arguments: str | Path) -> Iterator[Path]:
     """`mount ARGUMENTS folder`; skips the test where that is not allowed."""
     require("mount", "umount")
     folder.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ def mounted(folder: Path, *arguments: str | Path) -> Iterator[Path]:
 
 def tmpfs(folder: Path, size: str):
     """A disk of that size in memory."""
-    return mounted(folder, "-t", "tmpfs", "-o", f"size={size}", "tmpfs")
+    return mount(folder, "-t", "tmpfs", "-o", f"size={size}", "tmpfs")
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def ext4(folder: Path, size_bytes: int) -> Iterator[Path]:
     image.touch()
     os.truncate(image, size_bytes)
     run("mkfs.ext4", "-q", "-F", image)
-    with mounted(folder, "-o", "loop", image):
+    with mount(folder, "-o", "loop", image):
         yield folder
     image.unlink()
 

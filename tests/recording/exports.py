@@ -4,13 +4,13 @@ import csv
 
 import pyarrow.parquet
 
-from tests.recording.recorded import half_second, record
+from tests.recording.full_session import make_half_second, record
 from thermostand.recording.exporting.export import export
 from thermostand.recording.format.images import FrameEncoding
 from thermostand.recording.reading.session import Session
 
 
-def silent(done, text):
+def ignore_progress(done, text):
     pass
 
 
@@ -24,9 +24,9 @@ def parquet_rows(path):
     return table.select([name for name in table.column_names if name != "time_utc"]).to_pylist()  # datetime has no ns
 
 
-async def exported(tmp_path, *, count=12, items=half_second, encoding: FrameEncoding = "zstd", **choices):
+async def export_session(tmp_path, *, count=12, items=make_half_second, encoding: FrameEncoding = "zstd", **choices):
     """The recorded session, and the folder it was exported to."""
     await record(tmp_path / "s", count, items, encoding)
     session = Session.open(tmp_path / "s")
-    export(session, tmp_path / "out", report=silent, **choices)
+    export(session, tmp_path / "out", report=ignore_progress, **choices)
     return session, tmp_path / "out"

@@ -9,7 +9,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
-from tests.recording.declared import declared
+from tests.recording.device_declarations import declare_devices
 from tests.recording.disks import limit_files
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.hub import Hub
@@ -21,7 +21,7 @@ START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\n"}
 SETTINGS = RecordingSettings(stop_frames_below_bytes=0, alert_below_fraction=0.0)  # whatever this disk has
-DEVICES = declared(
+DEVICES = declare_devices(
     {
         "thermometers": "thermometers",
         "regulator": "regulator",

@@ -4,9 +4,9 @@ import json
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Event, StepMark, StepState
-from thermostand.recording.format.journal_lines import JOURNAL_NAME, journal_lines, mark_of
+from thermostand.recording.format.journal_lines import JOURNAL_NAME, format_lines, make_mark
 
-from .recorded import PUBLISHED, START_NS, half_second, record
+from .full_session import PUBLISHED, START_NS, make_half_second, record
 
 SECONDS = 20  # five segments of each series, four frames in each
 BEGUN = {"run": "night-1", "plan": "0f", "texts": {}, "seed": 7}
@@ -16,12 +16,12 @@ def second(time_ns, index):
     """A step a second, which captures a frame."""
     if not index:
         yield Event(time_ns, "info", "run.start", "recipe thermal_cycle", {"steps": SECONDS, "frames": SECONDS})
-    yield from half_second(time_ns, index)
+    yield from make_half_second(time_ns, index)
     if index == SECONDS - 1:
         yield Event(time_ns, "info", "run.end", "complete", {"status": "complete"})
 
 
-def killed(time_ns, index):
+def publish_killed(time_ns, index):
     """The same without an end."""
     yield from (item for item in second(time_ns, index) if getattr(item, "kind", "") != "run.end")
 
@@ -37,7 +37,7 @@ def ended(level, text, **data):
     return items
 
 
-def half_done(time_ns, index):
+def publish_half_done(time_ns, index):
     """Of the steps half are done, and the next one is begun, when the operator stops the run."""
     done = SECONDS // 2
     for item in second(time_ns, index):
@@ -60,7 +60,7 @@ def entries(seconds=SECONDS, status="complete"):
 
 def write_journal(directory, *found):
     """The journal of a session's folder."""
-    data = journal_lines((json.dumps(entry).encode() for entry in found), mark_of(directory.name))
+    data = format_lines((json.dumps(entry).encode() for entry in found), make_mark(directory.name))
     (directory / JOURNAL_NAME).write_bytes(data)
     return directory / JOURNAL_NAME
 

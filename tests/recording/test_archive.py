@@ -11,7 +11,7 @@ import pytest
 from tests.recording.runs import record_run
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.exporting import archive as module
-from thermostand.recording.exporting.archive import MANIFEST, Rule, archive, check_copy, delete, unfit
+from thermostand.recording.exporting.archive import MANIFEST, DeletionRule, archive, check_copy, delete, explain_unfit
 from thermostand.recording.reading.catalogue import look_at
 from thermostand.recording.reading.notes import add_note, add_tags, read_notes
 from thermostand.recording.reading.scan import verify
@@ -73,7 +73,7 @@ def test_notes_given_later_leave_it_archived(session: Path, nas: Path):
 
 def test_an_interrupted_copy_goes_on_behind_its_last_file(session: Path, nas: Path, monkeypatch):
     copied: list[str] = []
-    whole = module._copied
+    whole = module._copy_file
 
     def cut(source: Path, target: Path, report):
         if len(copied) == 4:
@@ -81,10 +81,10 @@ def test_an_interrupted_copy_goes_on_behind_its_last_file(session: Path, nas: Pa
         copied.append(source.name)
         return whole(source, target, report)
 
-    monkeypatch.setattr(module, "_copied", cut)
+    monkeypatch.setattr(module, "_copy_file", cut)
     with pytest.raises(KeyboardInterrupt):
         archive(look_at(session), nas, "eva", 5)
-    monkeypatch.setattr(module, "_copied", whole)
+    monkeypatch.setattr(module, "_copy_file", whole)
     assert not (nas / "night").exists()
     first = {path: path.stat().st_ino for path in (nas / "night.part").rglob("*.mcap")}
     assert first
@@ -112,7 +112,7 @@ def test_what_is_recorded_unfinished_or_may_be_resumed_is_not_copied(session: Pa
         with pytest.raises(SessionError, match=f"its run is {run} and may be resumed"):
             archive(replace(entry, run=run), nas, "eva", 5)
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0009.mcap.part")
-    assert "was never finished" in unfit(look_at(session))
+    assert "was never finished" in explain_unfit(look_at(session))
     assert not nas.exists()
 
 
@@ -124,7 +124,7 @@ def test_a_full_disk_is_reported_before_anything_is_copied(session: Path, nas: P
 
 def test_the_rule_says_what_may_be_deleted(session: Path, nas: Path):
     end_ns = look_at(session).end_utc_ns
-    rule = Rule(30)
+    rule = DeletionRule(30)
     assert not rule.applies(look_at(session), end_ns + 40 * DAY_NS)
     archive(look_at(session), nas, "eva", 5)
     entry = look_at(session)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.recorded import START_NS
+from tests.recording.full_session import START_NS
 from tests.recording.runs import record_run
 from thermostand.recording.reading import catalogue as module
-from thermostand.recording.reading.catalogue import INDEX_NAME, Memory, catalogue, look_at
+from thermostand.recording.reading.catalogue import INDEX_NAME, SessionCache, load_catalogue, look_at
 from thermostand.recording.reading.notes import add_note, add_tags
 
 
@@ -45,7 +45,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def listed(folder: Path, looks: list[str]) -> list[str]:
     """What a list says is what a look at each says; which sessions it has looked at."""
     looks.clear()
-    entries = catalogue(folder)
+    entries = load_catalogue(folder)
     looked = sorted(looks)
     assert entries == sorted((look_at(entry.path) for entry in entries), key=lambda entry: str(entry.path))
     return looked
@@ -57,14 +57,14 @@ def test_a_session_is_looked_at_once(folder: Path, looks: list[str]):
 
 
 def test_who_must_not_write_remembers_instead(folder: Path, looks: list[str]):
-    memory = Memory()
+    memory = SessionCache()
     for expected in (["a", "b", "c"], []):
         looks.clear()
-        assert [entry.path.name for entry in catalogue(folder, memory=memory)] == ["a", "b", "c"]
+        assert [entry.path.name for entry in load_catalogue(folder, memory=memory)] == ["a", "b", "c"]
         assert sorted(looks) == expected
     assert not (folder / INDEX_NAME).exists()
     shutil.rmtree(folder / "b")
-    assert len(catalogue(folder, memory=memory)) == len(memory) == 2
+    assert len(load_catalogue(folder, memory=memory)) == len(memory) == 2
 
 
 @pytest.mark.parametrize(
@@ -158,9 +158,9 @@ def test_the_progress_counts_those_that_are_looked_at(folder: Path):
         reported.append(count)
         return lambda done, text: reported.append((done, text))
 
-    catalogue(folder, progress)
+    load_catalogue(folder, progress)
     assert reported[0] == 3
     assert sorted(str(each[1]) for each in reported[1:] if isinstance(each, tuple)) == ["a", "b", "c"]
     reported.clear()
-    catalogue(folder, progress)
+    load_catalogue(folder, progress)
     assert reported == []

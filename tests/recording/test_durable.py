@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from tests.recording.declared import declared
+from tests.recording.device_declarations import declare_devices
 from tests.recording.disks import ext4, limit_files, run, tmpfs
 from thermostand.foundation.clock import NS_PER_S, VirtualClock, WallClock
 from thermostand.foundation.errors import SessionError
@@ -24,7 +24,7 @@ START_NS = 1_767_290_400 * NS_PER_S
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
 SETTINGS = RecordingSettings("raw", segment_s=2.0, stop_frames_below_bytes=0, alert_below_fraction=0.0)
-DEVICES = declared({"thermometers": "thermometers"})
+DEVICES = declare_devices({"thermometers": "thermometers"})
 
 
 class Stand:
@@ -116,7 +116,7 @@ async def test_nothing_waits_after_a_commit_and_what_waits_is_as_old_as_its_olde
         assert max(ages_s) == pytest.approx(18.75, abs=0.01)  # published at 0.25 s, looked at at 19 s
         assert ages_s[19] == ages_s[39] == ages_s[59] == 0.0
         stand.publish(stand.clock.now_ns(), True)
-        await stand.recorder.flushed()
+        await stand.recorder.flush()
         assert stand.recorder.waiting_since_ns is None
         assert stand.recorder.disk_free_bytes > 0
 
@@ -177,7 +177,7 @@ async def test_a_folder_that_was_removed_is_a_loss_at_once_and_none_is_made_agai
         assert stand.age_s() > 2
         (reported,) = stand.reported("folder_lost")
         assert reported.level == "error"
-        stand.recorder.refound()
+        stand.recorder.recover_folder()
         assert stand.recorder.folder_lost == ""
         await stand.seconds(3, frames=True)
         assert stand.age_s() == 0
@@ -215,7 +215,7 @@ async def test_a_folder_that_was_renamed_is_continued_when_it_is_back(tmp_path):
         assert f"it is {other}" in stand.recorder.folder_lost
         assert not directory.exists()
         other.rename(directory)
-        stand.recorder.refound()
+        stand.recorder.recover_folder()
         await stand.seconds(2, frames=True)
         assert (stand.age_s(), stand.recorder.folder_lost) == (0, "")
         assert stand.recorder.saved.frames == 8
@@ -234,7 +234,7 @@ async def test_a_renamed_folder_that_stays_away_keeps_what_it_has_and_another_on
         await stand.seconds(3, frames=True)
         directory.rename(other)
         await stand.seconds(3, frames=True)
-        stand.recorder.refound()
+        stand.recorder.recover_folder()
         await stand.seconds(2, frames=True)
         assert (stand.age_s(), stand.recorder.folder_lost) == (0, "")
     (loss,) = stand.reported("recording_lost")
@@ -256,7 +256,7 @@ async def test_a_folder_that_cannot_be_made_again_stays_a_loss(tmp_path):
             shutil.rmtree(directory)
             directory.write_text("in the way")
             await stand.seconds(2)
-            stand.recorder.refound()
+            stand.recorder.recover_folder()
             await stand.seconds(1)
             found.extend([stand.recorder.folder_lost, *stand.reported("folder_not_made")])
 
@@ -291,7 +291,7 @@ async def test_a_disk_that_hangs_does_not_keep_the_recorder_from_its_end(tmp_pat
         stand.recorder.start()
         recording = asyncio.create_task(stand.recorder.run())
         stand.publish(clock.now_ns(), True)
-        await stand.recorder.flushed()
+        await stand.recorder.flush()
         run("fsfreeze", "-f", disk)
         try:
             stand.publish(clock.now_ns(), True)

@@ -8,11 +8,11 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from tests.recording.exports import csv_rows, exported, parquet_rows, silent
-from tests.recording.recorded import ATTACHMENTS, INFO, MS, START_NS, frame, half_second, record
+from tests.recording.exports import csv_rows, export_session, ignore_progress, parquet_rows
+from tests.recording.full_session import ATTACHMENTS, INFO, MS, START_NS, frame, make_half_second, record
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.instants import utc_text
+from thermostand.foundation.instants import format_utc
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.exporting.export import export
@@ -40,7 +40,7 @@ def assert_readings_equal(session, channel, rows, column):
 
 
 async def test_csv_reads_back_every_value_exactly(tmp_path):
-    session, out = await exported(tmp_path)
+    session, out = await export_session(tmp_path)
     assert sorted(CHANNELS) == session.channels()
     for channel, (table, column) in CHANNELS.items():
         assert_readings_equal(session, channel, csv_rows(out / "telemetry" / f"{table}.csv"), column)
@@ -52,7 +52,7 @@ async def test_csv_reads_back_every_value_exactly(tmp_path):
 
 
 async def test_parquet_reads_back_every_value_exactly_and_typed(tmp_path):
-    session, out = await exported(tmp_path, telemetry="parquet")
+    session, out = await export_session(tmp_path, telemetry="parquet")
     for channel, (table, column) in CHANNELS.items():
         assert_readings_equal(session, channel, parquet_rows(out / "telemetry" / f"{table}.parquet"), column)
     schema = pyarrow.parquet.read_schema(out / "telemetry" / "thermometers.parquet")
@@ -66,7 +66,7 @@ async def test_parquet_reads_back_every_value_exactly_and_typed(tmp_path):
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])
 async def test_reasons_and_qualities_are_reported(tmp_path, table_format):
-    _, out = await exported(tmp_path, telemetry=table_format)
+    _, out = await export_session(tmp_path, telemetry=table_format)
     rows = (csv_rows if table_format == "csv" else parquet_rows)(out / "telemetry" / f"thermometers.{table_format}")
     assert len(rows) == 24, "the readings of a batch that have two instants are two rows"
     bad, stale = rows[8], rows[9]
@@ -93,7 +93,7 @@ async def test_quantities_that_were_not_declared_have_columns_each_unit_its_own(
         )
         yield Batch("thermometers", time_ns, readings)
 
-    session, out = await exported(tmp_path, count=1, items=items, telemetry=table_format)
+    session, out = await export_session(tmp_path, count=1, items=items, telemetry=table_format)
     rows = (csv_rows if table_format == "csv" else parquet_rows)(out / "telemetry" / f"thermometers.{table_format}")
     for name, column in (
         ("air", "air_degC"),
@@ -110,8 +110,8 @@ async def test_quantities_that_were_not_declared_have_columns_each_unit_its_own(
 @pytest.mark.parametrize("encoding", ["zstd", "raw"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 async def test_every_frame_is_a_png_of_its_pixels(tmp_path, encoding, dtype):
-    session, out = await exported(
-        tmp_path, items=lambda time_ns, index: half_second(time_ns, index, dtype), encoding=encoding
+    session, out = await export_session(
+        tmp_path, items=lambda time_ns, index: make_half_second(time_ns, index, dtype), encoding=encoding
     )
     names = sorted(path.name for path in (out / "frames").iterdir())
     assert names[:3] == ["000001.png", "000001.txt", "000002.png"]
@@ -129,12 +129,12 @@ def sidecar(path):
 
 
 async def test_the_sidecar_tells_the_temperatures_of_its_frame(tmp_path):
-    session, out = await exported(tmp_path)
+    session, out = await export_session(tmp_path)
     times_ns, air_degC = session.readings("thermometers.air")
     for number, shot in enumerate(session.frames(), 1):
         reported = sidecar(out / "frames" / f"{number:06d}.txt")
         assert reported["file"].strip() == f"{number:06d}.png"
-        assert reported["time_utc"].strip() == utc_text(shot.time_ns)
+        assert reported["time_utc"].strip() == format_utc(shot.time_ns)
         assert int(reported["time_ns"]) == shot.time_ns
         np.testing.assert_array_equal(float(reported["camera_temperature_degC"]), shot.camera_degC)
         assert (float(reported["exposure_s"]), float(reported["gain_dB"])) == (shot.exposure_s, shot.gain_dB)
@@ -157,13 +157,13 @@ async def test_a_reading_counts_from_its_own_instant(tmp_path):
             yield Batch("regulator", at_ns, (Reading("regulator.pv", pv_degC, "degC", at_ns),))
         yield frame(time_ns, index)
 
-    _, out = await exported(tmp_path, count=1, items=items)
+    _, out = await export_session(tmp_path, count=1, items=items)
     reported = sidecar(out / "frames" / "000001.txt")
     assert (reported["regulator.pv_degC"], reported["regulator.pv_age_s"]) == (" 21.0", " 0.0")
 
 
 async def test_the_index_says_what_the_sidecars_say(tmp_path):
-    _, out = await exported(tmp_path, telemetry=None)
+    _, out = await export_session(tmp_path, telemetry=None)
     rows = csv_rows(out / "frames" / "index.csv")
     assert len(rows) == 12
     for number, row in enumerate(rows, 1):
@@ -175,7 +175,7 @@ async def test_its_readme_says_how_a_text_was_changed_and_what_was_recorded_can_
         yield Event(time_ns, "info", "note", "=cmd|'/C calc'!A0\x1b[2J")
         yield Batch("regulator", time_ns, (Reading("regulator.pv", -1.5, "degC", time_ns),))
 
-    _, out = await exported(tmp_path, count=1, items=hostile)
+    _, out = await export_session(tmp_path, count=1, items=hostile)
     readme = " ".join((out / "README.txt").read_text(encoding="utf-8").split())
     assert "one of = + - @) has an apostrophe (')" in readme
     assert "Control characters" in readme
@@ -187,7 +187,7 @@ async def test_its_readme_says_how_a_text_was_changed_and_what_was_recorded_can_
 
 
 async def test_steps_events_metadata_and_attachments_are_there(tmp_path):
-    session, out = await exported(tmp_path, count=2, frames=False, telemetry=None)
+    session, out = await export_session(tmp_path, count=2, frames=False, telemetry=None)
     assert sorted(path.name for path in out.iterdir()) == [
         "README.txt",
         "attachments",
@@ -211,7 +211,7 @@ async def test_steps_events_metadata_and_attachments_are_there(tmp_path):
 
 
 async def test_the_descriptions_of_frames_are_a_table_of_their_own(tmp_path):
-    session, out = await exported(tmp_path, frames=False)
+    session, out = await export_session(tmp_path, frames=False)
     assert not (out / "frames").exists()
     rows = csv_rows(out / "telemetry" / "camera_meta.csv")
     assert [int(row["block_id"]) for row in rows] == [meta.block_id for meta in session.frame_metas()]
@@ -257,16 +257,16 @@ async def test_an_interrupted_export_leaves_nothing(tmp_path):
 
 
 async def test_nothing_is_overwritten_by_an_export(tmp_path):
-    session, out = await exported(tmp_path, count=1)
+    session, out = await export_session(tmp_path, count=1)
     before = sorted(out.rglob("*"))
     with pytest.raises(SessionError, match="exists already"):
-        export(session, out, report=silent)
+        export(session, out, report=ignore_progress)
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(SessionError, match="cannot be made"):
-        export(session, tmp_path / "file" / "out", report=silent)
+        export(session, tmp_path / "file" / "out", report=ignore_progress)
     (tmp_path / "next.part").mkdir()
     with pytest.raises(SessionError, match=r"next\.part: "):
-        export(session, tmp_path / "next", report=silent)
+        export(session, tmp_path / "next", report=ignore_progress)
     assert sorted(out.rglob("*")) == before
     assert (tmp_path / "next.part").is_dir()
 
@@ -275,7 +275,7 @@ async def test_nothing_is_overwritten_by_an_export(tmp_path):
 async def test_an_attachment_cannot_be_written_elsewhere(tmp_path, name):
     await record(tmp_path / "s", 1, attachments={name: "text"})
     with pytest.raises(SessionError, match="has no name"):
-        export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
+        export(Session.open(tmp_path / "s"), tmp_path / "out", report=ignore_progress)
     assert [path.name for path in tmp_path.iterdir()] == ["s"]
 
 
@@ -316,7 +316,7 @@ async def test_notes_and_tags_are_exported(tmp_path):
     await record(tmp_path / "s", 2)
     add_note(tmp_path / "s", "=SUM(A1)", "eva", START_NS)
     add_tags(tmp_path / "s", ["paper"], "eva", START_NS)
-    export(Session.open(tmp_path / "s"), tmp_path / "out", report=silent)
+    export(Session.open(tmp_path / "s"), tmp_path / "out", report=ignore_progress)
     assert [(row["kind"], row["text"]) for row in csv_rows(tmp_path / "out" / "notes.csv")] == [
         ("note", "'=SUM(A1)"),
         ("tag", "paper"),

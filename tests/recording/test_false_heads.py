@@ -12,7 +12,7 @@ import zstandard
 from tests.recording.damage import read_segment, write_segment
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD, Source
-from thermostand.recording.reading.walk import RangeCrcs
+from thermostand.recording.reading.segment_scan import RangeCrcs
 from thermostand.recording.repair.salvage import salvage_session
 
 ZSTD_HEAD = zstandard.ZstdCompressor().compress(bytes(1 << 20))[:9]

@@ -9,11 +9,11 @@ import pytest
 
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Reading
-from thermostand.recording.format.restarts import restarted
-from thermostand.recording.reading.interpolation import GAP_NS, interpolated
+from thermostand.recording.format.capture_restarts import make_restart_event
+from thermostand.recording.reading.interpolation import GAP_NS, interpolate
 from thermostand.recording.reading.session import Session
 
-from .recorded import MS, START_NS, frame, record
+from .full_session import MS, START_NS, frame, record
 
 S = 1_000_000_000
 PERIOD_NS = S // 2
@@ -64,7 +64,7 @@ async def test_frames_before_a_new_beginning_of_their_capture_are_superseded(tmp
     def again(time_ns: int, index: int):
         yield from items(time_ns, index)
         if index == 1:
-            yield restarted(time_ns, "capture-1", 1, "from a cold camera")
+            yield make_restart_event(time_ns, "capture-1", 1, "from a cold camera")
 
     await record(tmp_path / "s", 3, again)
     session = Session.open(tmp_path / "s")
@@ -98,12 +98,12 @@ async def test_a_session_without_frames_has_an_empty_table(tmp_path: Path):
 def test_readings_are_linear_between_and_unknown_across_gaps(at_s: float, beyond_s: int, expected: float):
     times_ns = np.array([0, 30, 60, 181, 220], np.int64) * S + START_NS
     values = np.array([1.0, np.nan, 3.0, 7.0, 8.0])
-    found = interpolated(times_ns, values, np.array([START_NS + int(at_s * S)]), beyond_s * S)
+    found = interpolate(times_ns, values, np.array([START_NS + int(at_s * S)]), beyond_s * S)
     np.testing.assert_allclose(found, [expected], rtol=1e-12)
 
 
 def test_no_reading_and_one_reading():
     at_ns = np.array([0, 1], np.int64)
-    assert np.isnan(interpolated(np.empty(0, np.int64), np.empty(0), at_ns)).all()
-    np.testing.assert_array_equal(interpolated(np.array([1]), np.array([5.0]), at_ns), [np.nan, 5.0])
+    assert np.isnan(interpolate(np.empty(0, np.int64), np.empty(0), at_ns)).all()
+    np.testing.assert_array_equal(interpolate(np.array([1]), np.array([5.0]), at_ns), [np.nan, 5.0])
     assert GAP_NS == 120 * S

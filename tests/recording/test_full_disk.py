@@ -14,7 +14,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.images import decode_image
-from thermostand.recording.reading.gaps import reported_blocks
+from thermostand.recording.reading.gaps import list_reported_blocks
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
@@ -57,7 +57,7 @@ class Night:
             self.hub.publish(frame(time_ns, self.published))
             self.hub.publish(Event(time_ns, "info", "note", f"second {self.published}"))
             self.published += 1
-        await self.recorder.flushed()
+        await self.recorder.flush()
 
     def reported(self, kind):
         return [event.text for event in self.events if event.kind == kind]
@@ -84,7 +84,7 @@ def readable_blocks(directory):
 
 def lost_blocks(night):
     """The block ids that the events name."""
-    for blocks in reported_blocks(night.events):
+    for blocks in list_reported_blocks(night.events):
         yield from blocks
 
 

@@ -14,28 +14,35 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from tests.recording.declared import declared
-from tests.recording.fuzzed import mutate_bytes, mutate_field, mutate_inside, mutate_order, put_together, take_apart
-from tests.recording.stored import CAMERA_TOPICS, stored
+from tests.recording.device_declarations import declare_devices
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
+from tests.recording.segment_fuzzer import (
+    mutate_bytes,
+    mutate_field,
+    mutate_inside,
+    mutate_order,
+    put_together,
+    take_apart,
+)
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from thermostand.recording.format.records import frame_places, read_frame, telemetry_messages
-from thermostand.recording.reading.overview import overview
+from thermostand.recording.format.records import list_frame_places, read_frame, read_telemetry_messages
+from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
-from thermostand.recording.writing.forms import telemetry_topics
-from thermostand.recording.writing.segment import SeriesForm
+from thermostand.recording.writing.segment import SeriesSpec
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import list_telemetry_topics
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n"}
-ENCODER = TelemetryEncoder(declared({"camera": "camera"}))
+ENCODER = TelemetryEncoder(declare_devices({"camera": "camera"}))
 SEGMENTS = (f"{TELEMETRY}/0000.mcap", f"{FRAMES}/0000.mcap")
 LIBC, MMAP_THRESHOLD = ctypes.CDLL(None), -3  # of mallopt(3)
 MEMORY_BYTES = 192 << 20  # more than it had; the largest honest need is 64 MiB for a chunk
@@ -69,18 +76,21 @@ def frame(second):
 def write_session(directory, encoding):
     """Four seconds in two chunks of telemetry, and four frames."""
     compression = CompressionType.NONE if encoding == "raw" else CompressionType.ZSTD
-    images = [stored(frame(k)) for k in range(4)]
+    images = [make_frame_records(frame(k)) for k in range(4)]
     halves = ([item for k in seconds for item in items(k)] for seconds in ((0, 1), (2, 3)))
     telemetry = [[record for item in half for record in ENCODER.encode(item)] for half in halves]
     write_series(directory / FRAMES, CAMERA_TOPICS, compression, images)
     write_series(
-        directory / TELEMETRY, telemetry_topics(declared({"camera": "camera"})), CompressionType.ZSTD, telemetry
+        directory / TELEMETRY,
+        list_telemetry_topics(declare_devices({"camera": "camera"})),
+        CompressionType.ZSTD,
+        telemetry,
     )
 
 
 def write_series(folder, topics, compression, commits):
     folder.mkdir(parents=True)
-    series = Series(folder, SeriesForm(folder.name, topics, compression, METADATA, ATTACHMENTS, 1 << 40, 1 << 60))
+    series = Series(folder, SeriesSpec(folder.name, topics, compression, METADATA, ATTACHMENTS, 1 << 40, 1 << 60))
     for records in commits:
         series.commit(records, START_NS)
     series.finish()
@@ -223,9 +233,9 @@ def recorded_messages(directory):
     session = Session.open(directory)
     for path in session.segments:
         if path.parent.name == TELEMETRY:
-            yield from telemetry_messages(path, lambda channel: True)
+            yield from read_telemetry_messages(path, lambda channel: True)
         else:
-            yield from ((frame.meta, bytes(frame.image)) for frame in map(read_frame, frame_places(path)))
+            yield from ((frame.meta, bytes(frame.image)) for frame in map(read_frame, list_frame_places(path)))
 
 
 @pytest.mark.parametrize(("seed", "part"), PARTS)
@@ -279,7 +289,7 @@ def test_verify_and_overview_answer_whatever_a_segment_holds(sound, tmp_path, mu
     found = 0
     with limits():
         for _ in mutants(directory, 400, mutations, VERIFICATIONS // 4 // part):
-            overview(directory)
+            summarise_session(directory)
             findings = verify(directory).findings
             found += bool(findings)
             assert not any("\n" in str(finding) for finding in findings)

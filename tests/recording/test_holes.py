@@ -14,19 +14,19 @@ from thermostand.foundation.items import StepState
 from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.replay import replay_and_record
 from thermostand.recording.exporting.trim import trim
-from thermostand.recording.format.holes import Hole, holes_in, holes_text
+from thermostand.recording.format.holes import Hole, format_holes, parse_holes
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.format.messages import TABLE_POSE
 from thermostand.recording.format.summary import read_summary
-from thermostand.recording.reading.overview import overview
-from thermostand.recording.reading.run_word import Files, RunOutcome
+from thermostand.recording.reading.overview import summarise_session
+from thermostand.recording.reading.run_status import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
 
 from .damage import METADATA, unlist, write_segment
-from .recorded import START_NS, images, record, telemetry
-from .runs import SECONDS, ended, entries, half_done, killed, record_run, remove, write_journal
+from .full_session import START_NS, images, record, telemetry
+from .runs import SECONDS, ended, entries, publish_half_done, publish_killed, record_run, remove, write_journal
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,10 @@ def words(directory):
     """Run and files, on which list, info and verify agree."""
     found = verify(directory)
     assert (scan(directory).run, scan(directory).files) == (found.run, found.files)
-    assert (overview(directory).scanned.run, overview(directory).scanned.files) == (found.run, found.files)
+    assert (summarise_session(directory).scanned.run, summarise_session(directory).scanned.files) == (
+        found.run,
+        found.files,
+    )
     assert found.is_sound == (found.files is Files.SOUND)
     return found.run, found.files
 
@@ -119,7 +122,7 @@ def test_without_its_journal_a_lost_tail_leaves_no_end_and_is_incomplete(session
 
 
 async def test_steps_that_the_journal_has_and_the_telemetry_has_not_are_missed(tmp_path):
-    directory = await record_run(tmp_path / "s", items=killed, status="")
+    directory = await record_run(tmp_path / "s", items=publish_killed, status="")
     assert words(directory) == (RunOutcome.INTERRUPTED, Files.SOUND)  # killed between two segments
     remove(directory, TELEMETRY, *last_numbers(directory, TELEMETRY, 2))
     remove(directory, FRAMES, *last_numbers(directory, FRAMES, 2))
@@ -158,9 +161,9 @@ async def test_a_run_has_its_own_word_and_its_files_are_sound(tmp_path, level, t
 
 
 async def test_steps_are_counted_against_the_plan(tmp_path):
-    directory = await record_run(tmp_path / "s", items=half_done, status="")
+    directory = await record_run(tmp_path / "s", items=publish_half_done, status="")
     write_journal(directory, *entries(SECONDS // 2, "stopped"))
-    found = overview(directory)
+    found = summarise_session(directory)
     assert (found.scanned.run, found.planned_steps) == (RunOutcome.STOPPED, SECONDS)
     assert [step.state for step in found.steps].count(StepState.DONE) == SECONDS // 2
 
@@ -253,7 +256,7 @@ def test_a_part_lacks_what_the_session_lacked_in_its_range_and_no_more(session, 
 
 
 async def test_a_part_is_sound_however_its_run_ended_and_so_is_a_part_of_it(tmp_path):
-    directory = await record_run(tmp_path / "s", items=half_done, status="")
+    directory = await record_run(tmp_path / "s", items=publish_half_done, status="")
     write_journal(directory, *entries(SECONDS // 2, "stopped"))
     trim(Session.open(directory), tmp_path / "part", START_NS, START_NS + 5 * NS_PER_S)
     assert words(tmp_path / "part") == (RunOutcome.STOPPED, Files.SOUND)
@@ -263,10 +266,10 @@ async def test_a_part_is_sound_however_its_run_ended_and_so_is_a_part_of_it(tmp_
 
 
 async def test_what_a_kill_cost_is_no_hole_and_its_copies_are_sound(tmp_path):
-    directory = await record_run(tmp_path / "s", items=killed, status="")
+    directory = await record_run(tmp_path / "s", items=publish_killed, status="")
     last = max((directory / TELEMETRY).iterdir())
     with last.open("rb") as file:
-        *_, chunk = read_summary(file, last.stat().st_size).chunks()
+        *_, chunk = read_summary(file, last.stat().st_size).iterate_chunks()
     last.with_name(f"{last.name}.part").write_bytes(last.read_bytes()[: chunk.offset + 30])
     last.unlink()
     unlist(last)
@@ -320,7 +323,7 @@ def test_a_field_that_this_version_does_not_know_is_named(session):
 
 def test_holes_in_a_record_are_read_again_and_nonsense_is_none():
     holes = (Hole(TELEMETRY, 3, 12, 5, 9, 6), Hole(FRAMES, None, None, None, 9, 1, True))
-    assert holes_in(holes_text(holes)) == holes
+    assert parse_holes(format_holes(holes)) == holes
     for text in (
         "",
         "null",
@@ -330,4 +333,4 @@ def test_holes_in_a_record_are_read_again_and_nonsense_is_none():
         "[" * 5000,
         '[{"series":"frames","excused":true}]',
     ):
-        assert [hole for hole in holes_in(text) if hole.first] == []
+        assert [hole for hole in parse_holes(text) if hole.first] == []

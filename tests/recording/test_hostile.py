@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.recording.recorded import record
+from tests.recording.full_session import record
 from tests.recording.runs import SECONDS, entries, second, write_journal
-from thermostand.foundation.documents import yaml_data
+from thermostand.foundation.documents import parse_yaml
 from thermostand.foundation.errors import ConfigError
 from thermostand.recording.exporting.tables import Column, CsvTable
 from thermostand.recording.repair.salvage import salvage_unfinished
 from thermostand.stand.commands.sessions.session_commands import app
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.learned import learn
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.estimating.learned_durations import learn_durations
 
 LONGEST_S = 60  # for 10 s of a machine that has nothing else to do
 
@@ -44,7 +44,7 @@ def _not_for_ever() -> Iterator[None]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run of the installed stand."""
     folder = tmp_path_factory.mktemp("recorded") / "night"
-    config_text = packaged("", "simulated").read_text("utf-8")
+    config_text = find_packaged("", "simulated").read_text("utf-8")
     asyncio.run(record(folder, SECONDS, second, segment_s=60.0, attachments={"config.yaml": config_text}))
     write_journal(folder, *entries())
     return folder
@@ -108,8 +108,8 @@ def test_a_run_is_not_held_up_by_what_somebody_left_beside_its_sessions(session:
 def test_an_odd_neighbour_never_ends_a_run(session: Path, text: str, monkeypatch: pytest.MonkeyPatch):
     """Its attached configuration is what somebody made it."""
     monkeypatch.setattr("thermostand.recording.reading.session.Session.attachment", lambda self, name: text)
-    config = load_config(packaged("", "simulated"))
-    learn(session.parent, config)
+    config = load_config(find_packaged("", "simulated"))
+    learn_durations(session.parent, config)
 
 
 def test_a_neighbour_that_breaks_the_reader_never_ends_a_run(session: Path, monkeypatch: pytest.MonkeyPatch):
@@ -117,7 +117,7 @@ def test_a_neighbour_that_breaks_the_reader_never_ends_a_run(session: Path, monk
         raise RuntimeError("a mistake of the program")
 
     monkeypatch.setattr("thermostand.recording.reading.session.Session.steps", broken)
-    learn(session.parent, load_config(packaged("", "simulated")))
+    learn_durations(session.parent, load_config(find_packaged("", "simulated")))
 
 
 def merges(depth: int) -> str:
@@ -138,7 +138,7 @@ def merges(depth: int) -> str:
 )
 def test_a_document_that_stands_for_millions_of_values_is_refused(text: str, reason: str):
     with pytest.raises(ConfigError, match=rf"^hostile\.yaml: .*({reason})"):
-        yaml_data(text, "hostile.yaml")
+        parse_yaml(text, "hostile.yaml")
 
 
 def test_a_document_of_thousands_of_keys_is_refused_in_a_short_line(tmp_path: Path):

@@ -11,19 +11,24 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.recording.stored import described, stored
+from tests.recording.frame_records import encode_description, make_frame_records
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.images import (
-    Circumstances,
+    FrameContext,
     decode_image,
+    decode_windows,
     encode_image,
     encode_meta,
     encode_png,
-    frame_topics,
-    windows_of,
+    name_frame_topics,
 )
-from thermostand.recording.format.messages import FRAME_META_CLASS, decode_frame_meta, decode_frame_table, frame_table
+from thermostand.recording.format.messages import (
+    FRAME_META_CLASS,
+    decode_frame_meta,
+    decode_frame_table,
+    encode_frame_table,
+)
 
 TIME_NS = 1_767_290_400_123_456_789
 DEPTHS = {"8 bit": ("u1", 255), "10 bit": ("<u2", 1023), "12 bit": ("<u2", 4095), "16 bit, big-endian": (">u2", 65535)}
@@ -79,7 +84,7 @@ def test_raw_samples_of_sixteen_bit_are_little_endian():
 @pytest.mark.parametrize(
     "image", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32), np.zeros((0, 4), np.uint8)]
 )
-@pytest.mark.parametrize("encode", [encode_image, described])
+@pytest.mark.parametrize("encode", [encode_image, encode_description])
 def test_an_image_of_another_kind_is_a_programming_mistake(image, encode):
     with pytest.raises(ValueError, match="uint8 or uint16 of shape"):
         encode(frame(image))
@@ -87,7 +92,7 @@ def test_an_image_of_another_kind_is_a_programming_mistake(image, encode):
 
 def test_a_frame_is_described_with_what_was_known_when_it_was_published():
     air, door = Reading("thermometers.air", 20.5, "degC", 7), Reading("linear.position", 4.0, "mm", 8)
-    known = Circumstances(TIME_NS + 9, "fit", 31.0, (air, door))
+    known = FrameContext(TIME_NS + 9, "fit", 31.0, (air, door))
     data = encode_meta(replace(frame(SMALL), step_id="capture-1", flags=("unsettled",), significant_bits=8), known)
     meta = decode_frame_meta(data)
     assert (meta.channel, meta.time_ns, meta.published_ns, meta.block_id) == ("camera.image", TIME_NS, TIME_NS + 9, 7)
@@ -102,24 +107,24 @@ def test_a_frame_is_described_with_what_was_known_when_it_was_published():
 
 @pytest.mark.parametrize(("dtype", "bits"), [(np.uint8, 8), (np.uint16, 16)])
 def test_without_a_word_of_the_camera_all_bits_are_significant(dtype, bits):
-    assert decode_frame_meta(described(frame(SMALL.astype(dtype)))).significant_bits == bits
+    assert decode_frame_meta(encode_description(frame(SMALL.astype(dtype)))).significant_bits == bits
 
 
 def test_each_camera_has_topics_of_its_own():
-    assert frame_topics("camera.image") == ("/camera/meta", "/camera/image")
-    assert frame_topics("side.image") == ("/side/meta", "/side/image")
-    assert [record.topic for record in stored(replace(frame(SMALL), channel="side.image"))] == [
+    assert name_frame_topics("camera.image") == ("/camera/meta", "/camera/image")
+    assert name_frame_topics("side.image") == ("/side/meta", "/side/image")
+    assert [record.topic for record in make_frame_records(replace(frame(SMALL), channel="side.image"))] == [
         "/side/meta",
         "/side/image",
     ]
 
 
 def test_windows_come_back_with_the_description():
-    windows = windows_of(decode_frame_meta(described(frame(SMALL, WINDOWS))))
+    windows = decode_windows(decode_frame_meta(encode_description(frame(SMALL, WINDOWS))))
     assert windows is not None
     assert windows.dtype == np.int32
     np.testing.assert_array_equal(windows, WINDOWS)
-    assert windows_of(decode_frame_meta(described(frame(SMALL)))) is None
+    assert decode_windows(decode_frame_meta(encode_description(frame(SMALL)))) is None
 
 
 BAD_WINDOWS = [[[0, 0, 15, 9]], [[-1, 0, 3, 3]], [[3, 3, 0, 3]], [[2**31 - 1, 0, 2**31 - 1, 1]]]
@@ -128,20 +133,24 @@ BAD_WINDOWS = [[[0, 0, 15, 9]], [[-1, 0, 3, 3]], [[3, 3, 0, 3]], [[2**31 - 1, 0,
 @pytest.mark.parametrize("bad", [*BAD_WINDOWS, []])
 def test_windows_outside_the_image_are_a_programming_mistake(bad):
     with pytest.raises(ValueError, match="window"):
-        described(frame(SMALL, np.array(bad, np.int32).reshape(-1, 4)))
+        encode_description(frame(SMALL, np.array(bad, np.int32).reshape(-1, 4)))
 
 
 @pytest.mark.parametrize("bad", [*(np.array(bad, "<i4").tobytes() for bad in BAD_WINDOWS), b"123"])
 def test_recorded_windows_that_cannot_be_right_are_a_session_error(bad):
-    meta = replace(decode_frame_meta(described(frame(SMALL, WINDOWS))), windows=bad)
+    meta = replace(decode_frame_meta(encode_description(frame(SMALL, WINDOWS))), windows=bad)
     with pytest.raises(SessionError, match="windows of a recorded"):
-        windows_of(meta)
+        decode_windows(meta)
 
 
 def test_the_table_of_frames_has_every_description():
-    descriptions = [described(replace(frame(SMALL), block_id=number, step_id=number * "x")) for number in range(300)]
-    assert repr(decode_frame_table(frame_table(descriptions))) == repr(list(map(decode_frame_meta, descriptions)))
-    for damaged in (frame_table(descriptions)[:-1], b"\xff"):
+    descriptions = [
+        encode_description(replace(frame(SMALL), block_id=number, step_id=number * "x")) for number in range(300)
+    ]
+    assert repr(decode_frame_table(encode_frame_table(descriptions))) == repr(
+        list(map(decode_frame_meta, descriptions))
+    )
+    for damaged in (encode_frame_table(descriptions)[:-1], b"\xff"):
         with pytest.raises(SessionError, match="table of frames"):
             decode_frame_table(damaged)
 

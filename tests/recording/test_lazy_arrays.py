@@ -15,10 +15,10 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import images
-from thermostand.recording.format.restarts import restarted
+from thermostand.recording.format.capture_restarts import make_restart_event
 from thermostand.recording.reading.session import Session
 
-from .recorded import MS, START_NS, frame, record
+from .full_session import MS, START_NS, frame, record
 
 S = 1_000_000_000
 
@@ -32,7 +32,7 @@ def items(time_ns: int, index: int):
     parameters: dict[str, object] = {"frames": 1, "role": "fit", "chamber_degC": 20.0 + index}
     yield StepMark(time_ns, f"capture-{index}", index, "capture", StepState.STARTED, parameters)
     if index == 4:
-        yield restarted(time_ns, "capture-3", 1, "from a cold camera")
+        yield make_restart_event(time_ns, "capture-3", 1, "from a cold camera")
     yield frame(time_ns - 50 * MS, index)
 
 

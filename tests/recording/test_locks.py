@@ -38,7 +38,7 @@ def left(file: int) -> Iterator[int]:
 
 
 def test_the_holder_is_the_process_that_has_locked_the_file(file: int, left: int):
-    assert locks.holder(file) == left
+    assert locks.find_holder(file) == left
 
 
 @pytest.mark.parametrize("listed", [[True, False], [False, True]])
@@ -47,7 +47,7 @@ def test_who_was_seen_once_is_named_when_the_list_leaves_it_out(
 ):
     looks = iter(listed)
     monkeypatch.setattr(locks, "_LEFT_WITHIN_S", 0.2)
-    monkeypatch.setattr(locks, "holder", lambda fd: left if next(looks, False) else 0)
+    monkeypatch.setattr(locks, "find_holder", lambda fd: left if next(looks, False) else 0)
     with pytest.raises(BlockingIOError, match=f"process {left} still waits"):
         locks.lock(file)
 
@@ -60,7 +60,7 @@ def test_a_file_of_the_same_number_on_another_disk_is_another(device: tuple[int,
         "2: -> FLOCK  ADVISORY  WRITE 33 00:2b:13 0 EOF\n"
         "3: POSIX  ADVISORY  WRITE 34 07:01:13 0 EOF\n"
     )
-    assert locks._listed(listed, os.makedev(*device), 13) == pid
+    assert locks._find_in_list(listed, os.makedev(*device), 13) == pid
 
 
 def test_a_lock_is_taken_when_its_holder_has_gone(file: int):

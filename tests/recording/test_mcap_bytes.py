@@ -10,10 +10,10 @@ from mcap.reader import SeekingReader
 from tests.recording.damage import write_segment
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.layout import TELEMETRY
-from thermostand.recording.format.mcap_bytes import Source, chunk_content, records
-from thermostand.recording.format.records import telemetry_messages
+from thermostand.recording.format.mcap_bytes import Source, decompress_chunk, iterate_records
+from thermostand.recording.format.records import read_telemetry_messages
 from thermostand.recording.reading.scan import verify
-from thermostand.recording.reading.walk import stored_messages, survey
+from thermostand.recording.reading.segment_scan import read_stored_messages, scan_segment
 from thermostand.recording.repair.salvage import salvage_session
 
 RECORDS = struct.pack("<BQ", 3, 5) + b"hello" + struct.pack("<BQ", 4, 0)
@@ -28,9 +28,9 @@ def chunk(data=RECORDS, size=None, crc=None, name=b"", data_bytes=None, packed=N
 
 @pytest.mark.parametrize("name", [b"", b"zstd"])
 def test_a_sound_chunk_gives_its_head_and_its_records(name):
-    head, content = chunk_content(memoryview(chunk(name=name)))
+    head, content = decompress_chunk(memoryview(chunk(name=name)))
     assert (head.first_ns, head.last_ns, head.size_bytes, head.compression) == (1, 2, len(RECORDS), name)
-    assert list(records(content)) == [(3, b"hello"), (4, b"")]
+    assert list(iterate_records(content)) == [(3, b"hello"), (4, b"")]
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_a_sound_chunk_gives_its_head_and_its_records(name):
 )
 def test_a_damaged_chunk_is_refused(damaged, text):
     with pytest.raises(ValueError, match=text):
-        chunk_content(memoryview(damaged))
+        decompress_chunk(memoryview(damaged))
 
 
 def test_what_the_reader_refuses_neither_salvage_nor_verification_accepts(tmp_path):
@@ -61,7 +61,7 @@ def test_what_the_reader_refuses_neither_salvage_nor_verification_accepts(tmp_pa
     large[place + 25 : place + 33] = struct.pack("<Q", 1 << 40)  # its size, uncompressed
     path.write_bytes(large)
     with pytest.raises(SessionError, match="a chunk"):
-        list(telemetry_messages(path, lambda channel: True))
+        list(read_telemetry_messages(path, lambda channel: True))
     assert any("a chunk claims" in finding.text for finding in verify(tmp_path).findings)
     (done,) = salvage_session(tmp_path)
     assert done.lost_bytes > 0
@@ -73,10 +73,10 @@ def test_a_disk_that_reads_differently_each_time_is_the_disks_error(tmp_path):
     write_segment(path.parent, TELEMETRY, range(3), finish=True)
     with path.open("r+b") as file:
         source = Source(file.fileno())
-        place = survey(source).chunks[0]
-        assert list(stored_messages(source, place))
+        place = scan_segment(source).chunks[0]
+        assert list(read_stored_messages(source, place))
         file.seek(place.offset + place.length - 1)
         file.write(b"\xff")
         file.flush()
         with pytest.raises(OSError, match="reads differently"):
-            list(stored_messages(source, place))
+            list(read_stored_messages(source, place))

@@ -8,12 +8,12 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.recording.declared import KINDS, form
+from tests.recording.device_declarations import KINDS, form
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Channel, Frame, Quality, Reading, bad_reading
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import RecordedDevice, batch_form, form_of
+from thermostand.recording.format.batches import RecordedDevice, make_batch_schema, parse_batch_schema
 
 TIME_NS = 1_767_290_400_123_456_789
 
@@ -97,8 +97,8 @@ units = st.sampled_from(["", "1", "%", "degC", "mm", "l/min", "m^3/h", "Âµm", "Î
 
 @given(st.lists(st.builds(Channel, names, units, st.just("")), unique=True, max_size=6))
 def test_channels_of_any_name_and_unit_have_a_field_each_and_are_known_again(channels):
-    known = batch_form("dev", RecordedDevice("added", tuple(channels)))
-    assert form_of(known.metadata) is known
+    known = make_batch_schema("dev", RecordedDevice("added", tuple(channels)))
+    assert parse_batch_schema(known.metadata) is known
     assert len(set(known.fields)) == len(channels)
     readings = tuple(Reading(f"dev.{each.name}", 1.5 + at, each.unit, TIME_NS) for at, each in enumerate(channels))
     data = known.encode(Batch("dev", TIME_NS, readings))
@@ -118,7 +118,7 @@ def test_channels_of_any_name_and_unit_have_a_field_each_and_are_known_again(cha
 )
 def test_a_topic_that_does_not_say_what_it_holds_is_refused(metadata):
     with pytest.raises(ValueError, match=r"channel|device|list"):
-        form_of(metadata)
+        parse_batch_schema(metadata)
 
 
 def test_nan_is_the_same_bytes_whatever_arithmetic_made_it():

@@ -3,9 +3,9 @@
 import pytest
 from mcap.reader import make_reader
 
-from tests.recording.recorded import ATTACHMENTS, images, record, telemetry
+from tests.recording.full_session import ATTACHMENTS, images, record, telemetry
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.exporting.one_file import export_mcap
+from thermostand.recording.exporting.mcap_export import export_mcap
 from thermostand.recording.format.images import FrameEncoding
 from thermostand.recording.reading.notes import add_note
 from thermostand.recording.reading.session import Session

@@ -9,14 +9,14 @@ import pytest
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.foundation.instants import date_time, duration, parse_instant, utc_text
+from thermostand.foundation.instants import format_date_time, format_duration, format_utc, parse_instant
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading, bad_reading
-from thermostand.recording.format.inventory import SegmentState, inventory
-from thermostand.recording.reading.overview import overview
+from thermostand.recording.format.inventory import SegmentState, list_segments
+from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.scan import scan
 
-from .recorded import ATTACHMENTS, START_NS, record
+from .full_session import ATTACHMENTS, START_NS, record
 
 SECONDS = 10
 CAPTURE = {"frames": 6, "interval_s": 1.0, "role": "fit", "chamber_degC": 31.0}
@@ -69,7 +69,7 @@ async def test_a_glance_tells_what_when_and_how_much(session):
 
 
 async def test_the_overview_has_the_steps_as_they_went(session):
-    steps = overview(session).steps
+    steps = summarise_session(session).steps
     assert [(step.index, step.kind, str(step.state), step.frames) for step in steps] == [
         (3, "soak", "done", 0),
         (4, "capture", "failed", 5),
@@ -81,7 +81,7 @@ async def test_the_overview_has_the_steps_as_they_went(session):
 
 
 async def test_the_overview_has_frames_temperatures_and_events(session):
-    found = overview(session)
+    found = summarise_session(session)
     frames = found.frames
     assert (frames.count, frames.dropped) == (5, 3)
     assert frames.pixels == "16 x 12 px, 16 bit"
@@ -101,7 +101,7 @@ async def test_a_damaged_segment_is_reported_and_the_others_are_read(session):
     path = session / "telemetry" / "0001.mcap"
     path.write_bytes(path.read_bytes()[:-20])
     assert scan(session).state_text.startswith("damaged: telemetry/0001.mcap: ")
-    found = overview(session)
+    found = summarise_session(session)
     assert {each.where for each in found.scanned.findings} == {"telemetry/0001.mcap"}
     assert 5 <= found.channels[2].count < 10
     assert found.frames.count == 5
@@ -114,7 +114,7 @@ async def test_a_recording_without_a_finished_segment_still_tells_what_it_is(ses
     assert seen.metadata["recipe"] == "thermal_cycle"
     assert (seen.files, len(seen.sentences(seen.files))) == ("incomplete", len(seen.inventory))
     assert (seen.frames, seen.begin_ns, seen.end_ns) == (0, None, None)
-    assert overview(session).steps == ()
+    assert summarise_session(session).steps == ()
 
 
 async def test_a_session_without_telemetry_is_not_complete(session):
@@ -126,7 +126,7 @@ async def test_a_session_without_telemetry_is_not_complete(session):
     assert said.endswith(f" and {kept - 1} more")
     shutil.rmtree(session / "telemetry")
     assert scan(session).state_text == "incomplete: telemetry: is missing"
-    assert overview(session).frames.count == 5
+    assert summarise_session(session).frames.count == 5
 
 
 async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_never_came(tmp_path):
@@ -137,7 +137,7 @@ async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_n
                 yield Event(time_ns, "error", "frames_dropped", "frames lost", {"blocks": blocks})
 
     await record(tmp_path / "s", SECONDS, items=items, period_ns=NS_PER_S)
-    frames = overview(tmp_path / "s").frames
+    frames = summarise_session(tmp_path / "s").frames
     assert (frames.dropped, frames.lost_by_recorder) == (3, 4)
 
 
@@ -156,7 +156,7 @@ async def test_a_segment_that_may_not_be_opened_hides_no_other(session):
     part.write_bytes(b"")
     part.chmod(0)
     assert scan(session).state_text.startswith("incomplete: telemetry/0009.mcap.part: is not finished")
-    assert [file for file in inventory(session) if file.path != part] == list(before.inventory)
+    assert [file for file in list_segments(session) if file.path != part] == list(before.inventory)
 
 
 def test_a_segment_that_is_given_another_name_meanwhile_hides_no_other(tmp_path):
@@ -175,7 +175,7 @@ def test_a_segment_that_is_given_another_name_meanwhile_hides_no_other(tmp_path)
     renaming = threading.Thread(target=rename)
     renaming.start()
     try:
-        seen = [[file.name for file in inventory(tmp_path)] for _ in range(2000)]
+        seen = [[file.name for file in list_segments(tmp_path)] for _ in range(2000)]
     finally:
         stop.set()
         renaming.join()
@@ -185,10 +185,10 @@ def test_a_segment_that_is_given_another_name_meanwhile_hides_no_other(tmp_path)
 async def test_a_look_leaves_no_lock(session):
     part = session / "telemetry" / "0009.mcap.part"
     part.write_bytes(b"")
-    assert inventory(session)
+    assert list_segments(session)
     with part.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        assert [entry.state for entry in inventory(session) if entry.path == part] == [SegmentState.RECORDING]
+        assert [entry.state for entry in list_segments(session) if entry.path == part] == [SegmentState.RECORDING]
 
 
 def test_a_folder_without_segments_is_no_session(tmp_path):
@@ -229,11 +229,11 @@ def test_a_time_that_no_recording_has_is_refused(text):
 
 def test_the_last_second_of_the_calendar_is_a_time():
     last_ns = parse_instant("9999-12-31T23:59:59.999999Z", START_NS)
-    assert utc_text(last_ns) == "9999-12-31T23:59:59.999999000Z"
+    assert format_utc(last_ns) == "9999-12-31T23:59:59.999999000Z"
     assert parse_instant("1970-01-01", START_NS) == 0
 
 
 def test_instants_and_durations_as_people_write_them():
-    assert date_time(START_NS) == "2026-01-01 18:00:00"
-    texts = [duration(round(length_s * NS_PER_S)) for length_s in (4.25, 59.99, 61, 3600, 90_000)]
+    assert format_date_time(START_NS) == "2026-01-01 18:00:00"
+    texts = [format_duration(round(length_s * NS_PER_S)) for length_s in (4.25, 59.99, 61, 3600, 90_000)]
     assert texts == ["4.2 s", "60.0 s", "0:01:01", "1:00:00", "1 day, 1:00:00"]

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.recorded import INFO, PUBLISHED
+from tests.recording.full_session import INFO, PUBLISHED
 from tests.recording.runs import SECONDS, entries, record_run, remove, second, write_journal
-from tests.stand.hostile_sessions import event, everywhere, rewritten
+from tests.stand.hostile_sessions import event, everywhere, rewrite
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark
 from thermostand.foundation.readings import Channel, Frame
 from thermostand.recording.format.batches import RecordedDevice
-from thermostand.recording.format.journal_lines import JOURNAL_NAME, text_hash
+from thermostand.recording.format.journal_lines import JOURNAL_NAME, hash_text
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
-from thermostand.recording.format.manifest import MANIFEST_NAME, Sealed, SessionInfo, journal_so_far, read_manifest
-from thermostand.recording.reading.overview import overview
-from thermostand.recording.reading.run_word import Files
+from thermostand.recording.format.manifest import MANIFEST_NAME, Sealed, SessionInfo, digest_journal, read_manifest
+from thermostand.recording.reading.overview import summarise_session
+from thermostand.recording.reading.run_status import Files
 from thermostand.recording.reading.scan import Depth, scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
@@ -64,7 +64,7 @@ def test_a_segment_that_has_only_another_name_is_missing(session, name):
 
 
 def test_a_text_that_was_edited_in_one_segment_is_damage(session):
-    rewritten(session / FRAMES / "0001.mcap", attachments={"config.yaml": b"camera: {gain_dB: 9.0}\n"})
+    rewrite(session / FRAMES / "0001.mcap", attachments={"config.yaml": b"camera: {gain_dB: 9.0}\n"})
     assert words(session) is Files.DAMAGED
     with pytest.raises(SessionError, match=r"frames/0001\.mcap: has other texts"):
         list(Session.open(session).frames())
@@ -72,12 +72,12 @@ def test_a_text_that_was_edited_in_one_segment_is_damage(session):
 
 @pytest.mark.parametrize("text", [b"camera: {gain_dB: 9.0}\n", None])
 def test_a_text_that_was_edited_or_removed_everywhere_is_not_what_the_run_began_with(session, text):
-    texts = {name: text_hash(known) for name, known in Session.open(session).attachments.items()}
+    texts = {name: hash_text(known) for name, known in Session.open(session).attachments.items()}
     begun, *rest = entries()
     write_journal(session, {**begun, "texts": texts}, *rest)
     assert words(session) is Files.SOUND
     if text is None:
-        begun = {**begun, "texts": {**texts, "recipe.yaml": text_hash("a recipe that was attached")}}
+        begun = {**begun, "texts": {**texts, "recipe.yaml": hash_text("a recipe that was attached")}}
         write_journal(session, begun, *rest)
     else:
         everywhere(session, attachments={"config.yaml": text})
@@ -105,7 +105,7 @@ async def test_complete_without_a_planned_capture_is_incomplete(tmp_path):
 def test_segments_of_another_session_of_the_same_second_and_recipe_are_not_its_own(session):
     everywhere(session, uid="00ff")
     assert words(session) is Files.SOUND
-    rewritten(session / FRAMES / "0001.mcap", uid="11ee")
+    rewrite(session / FRAMES / "0001.mcap", uid="11ee")
     assert words(session) is Files.DAMAGED
 
 
@@ -130,8 +130,8 @@ def end(directory, **changes):
     """The manifest as it is written last, with the journal as it is now."""
     stated = replace(read_manifest(directory), **changes)
     data = (directory / JOURNAL_NAME).read_bytes()
-    ended = replace(stated, plan={"steps": SECONDS, "frames": SECONDS}, ended=True, journal=journal_so_far(data))
-    (directory / MANIFEST_NAME).write_bytes(ended.encoded())
+    ended = replace(stated, plan={"steps": SECONDS, "frames": SECONDS}, ended=True, journal=digest_journal(data))
+    (directory / MANIFEST_NAME).write_bytes(ended.encode())
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def edit_manifest(directory, old, new):
 
 
 def remake_manifest(directory, **changes):
-    (directory / MANIFEST_NAME).write_bytes(replace(read_manifest(directory), **changes).encoded())
+    (directory / MANIFEST_NAME).write_bytes(replace(read_manifest(directory), **changes).encode())
 
 
 def without(stated, *names):
@@ -174,7 +174,7 @@ def without(stated, *names):
 def rewrite_without_topic(directory, topic):
     """Nothing of that topic is left in any segment, and whoever did it forgot the manifest."""
     for path in sorted((directory / TELEMETRY).glob("*.mcap")):
-        rewritten(path, relist=False, without=topic)
+        rewrite(path, relist=False, without=topic)
 
 
 def empty_segment(directory):
@@ -197,7 +197,7 @@ CASES = {
         lambda s: swap_with(s, "frames/0002.mcap"), Files.DAMAGED, "frames/0002.mcap", True
     ),
     "a segment rewritten with another event": (
-        lambda s: rewritten(s / TELEMETRY / "0001.mcap", relist=False, behind=[event("note", "all is well", "")]),
+        lambda s: rewrite(s / TELEMETRY / "0001.mcap", relist=False, behind=[event("note", "all is well", "")]),
         Files.DAMAGED, "telemetry/0001.mcap", True,
     ),
     "an empty segment behind the last": (empty_segment, Files.DAMAGED, "telemetry/0006.mcap", True),
@@ -251,7 +251,7 @@ CASES = {
         lambda s: remake_manifest(s, texts={}), Files.DAMAGED, "", True
     ),
     "a text removed that the manifest lists": (
-        lambda s: remake_manifest(s, texts={**read_manifest(s).texts, "recipe.yaml": text_hash("a: 1")}),
+        lambda s: remake_manifest(s, texts={**read_manifest(s).texts, "recipe.yaml": hash_text("a: 1")}),
         Files.DAMAGED, "", True,
     ),
     "a bit flipped where no CRC is": (
@@ -281,7 +281,7 @@ def test_each_case_has_its_word_and_its_sentence_in_all_that_reads(night, change
     if is_listed:
         listed = scan(night)
         assert listed.files is files
-        assert overview(night).scanned.files is files
+        assert summarise_session(night).scanned.files is files
         assert where in [finding.where for finding in listed.findings if finding.files is files]
     if where != JOURNAL_NAME and is_listed:  # no export and no fit reads the journal
         with pytest.raises(SessionError):

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
-from tests.recording.declared import KINDS, declared, form
-from tests.recording.fuzzed import put_together, take_apart
-from tests.recording.recorded import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
-from tests.recording.stored import CAMERA_TOPICS, stored
+from tests.recording.device_declarations import KINDS, declare_devices, form
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
+from tests.recording.full_session import ATTACHMENTS, DEVICES, INFO, START_NS, images, item_key, record, telemetry
+from tests.recording.segment_fuzzer import put_together, take_apart
 from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
@@ -23,15 +23,15 @@ from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format import messages
 from thermostand.recording.format.batches import RecordedDevice
-from thermostand.recording.format.images import frame_topics
+from thermostand.recording.format.images import name_frame_topics
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
-from thermostand.recording.format.records import frame_places, telemetry_messages
+from thermostand.recording.format.records import list_frame_places, read_telemetry_messages
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import frames_topic, telemetry_topics
 from thermostand.recording.writing.recorder import Recorder
-from thermostand.recording.writing.segment import MessageRecord, SeriesForm
+from thermostand.recording.writing.segment import MessageRecord, SeriesSpec
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import list_telemetry_topics, make_frames_topic
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 METADATA = {"format": str(FORMAT), "session_id": "night-1"}
@@ -50,7 +50,7 @@ def small_frame(second, block_id=None):
 def write(folder, topics, commits, compression=CompressionType.NONE, attachments=ATTACHMENTS):
     """One more segment in `folder`, a chunk for each commit."""
     folder.mkdir(parents=True, exist_ok=True)
-    series = Series(folder, SeriesForm(folder.name, topics, compression, METADATA, attachments, 1 << 40, 1 << 60))
+    series = Series(folder, SeriesSpec(folder.name, topics, compression, METADATA, attachments, 1 << 40, 1 << 60))
     for records in commits:
         series.commit(records, START_NS)
     series.finish()
@@ -59,11 +59,13 @@ def write(folder, topics, commits, compression=CompressionType.NONE, attachments
 def write_items(directory, items, devices=DEVICES, **options):
     """A telemetry segment with these items, each in a chunk of its own."""
     encoder = TelemetryEncoder(devices)
-    write(directory / TELEMETRY, telemetry_topics(devices), [list(encoder.encode(item)) for item in items], **options)
+    write(
+        directory / TELEMETRY, list_telemetry_topics(devices), [list(encoder.encode(item)) for item in items], **options
+    )
 
 
 def write_images(directory, frames):
-    write(directory / FRAMES, CAMERA_TOPICS, list(map(stored, frames)), CompressionType.ZSTD)
+    write(directory / FRAMES, CAMERA_TOPICS, list(map(make_frame_records, frames)), CompressionType.ZSTD)
 
 
 def air(value, second, **changes):
@@ -155,8 +157,8 @@ def test_a_frame_comes_behind_what_was_published_at_its_instant_and_before_the_e
 def test_frames_of_one_instant_are_distinguished_by_their_camera_and_number(tmp_path):
     write_items(tmp_path, [batch(1)])
     frames = [small_frame(1, 7), replace(small_frame(1, 7), channel="side.image"), small_frame(1, 8)]
-    side = tuple(map(frames_topic, frame_topics("side.image")))
-    write(tmp_path / FRAMES, (*CAMERA_TOPICS, *side), list(map(stored, frames)), CompressionType.ZSTD)
+    side = tuple(map(make_frames_topic, name_frame_topics("side.image")))
+    write(tmp_path / FRAMES, (*CAMERA_TOPICS, *side), list(map(make_frame_records, frames)), CompressionType.ZSTD)
     session = Session.open(tmp_path)
     assert [(frame.channel, frame.block_id) for frame in session.frames()] == [
         ("camera.image", 7),
@@ -202,7 +204,7 @@ def test_images_come_as_they_were_recorded(tmp_path):
     write_items(tmp_path, [batch(0)])
     write_images(tmp_path, [small_frame(0)])
     (image,) = Session.open(tmp_path).images()
-    assert (image.description, bytes(image.data)) == tuple(record.data for record in stored(small_frame(0)))
+    assert (image.description, bytes(image.data)) == tuple(record.data for record in make_frame_records(small_frame(0)))
     assert (image.time_ns, image.meta.block_id, image.path) == (at(0), 0, tmp_path / FRAMES / "0000.mcap")
 
 
@@ -210,7 +212,7 @@ def test_the_table_of_frames_is_read_without_an_image(tmp_path):
     write_items(tmp_path, [batch(0)])
     write_images(tmp_path, [small_frame(second) for second in range(3)])
     path = tmp_path / FRAMES / "0000.mcap"
-    (places, data) = frame_places(path), bytearray(path.read_bytes())
+    (places, data) = list_frame_places(path), bytearray(path.read_bytes())
     for place in places:
         data[place.chunk.offset + place.chunk.length - 4] ^= 0xFF  # within the compressed image
     path.write_bytes(data)
@@ -286,8 +288,8 @@ def test_a_device_that_joined_later_takes_nothing_from_the_first(tmp_path):
     def moved(device, unit, second):
         return Batch(device, at(second), (Reading(f"{device}.position", float(second), unit, at(second)),))
 
-    write_items(tmp_path, [moved("linear", "mm", 0)], declared({"linear": "axis"}))
-    both = declared({"linear": "axis", "rotary": "axis"})
+    write_items(tmp_path, [moved("linear", "mm", 0)], declare_devices({"linear": "axis"}))
+    both = declare_devices({"linear": "axis", "rotary": "axis"})
     write_items(tmp_path, [moved("linear", "mm", 1), moved("rotary", "deg", 2)], both)
     session = Session.open(tmp_path)
     assert session.readings("rotary.position")[1].tolist() == [2.0]
@@ -374,7 +376,7 @@ def test_wrong_content_under_right_crcs_is_reported(tmp_path, change, sentence):
 
 def test_a_step_nested_deeper_than_python_goes_is_reported(tmp_path):
     step = messages.CLASSES[messages.STEP](state="done", parameters_json="[" * 200_000).SerializeToString()
-    write(tmp_path / TELEMETRY, telemetry_topics({}), [[MessageRecord(messages.STEP, START_NS, step)]])
+    write(tmp_path / TELEMETRY, list_telemetry_topics({}), [[MessageRecord(messages.STEP, START_NS, step)]])
     with pytest.raises(SessionError, match="a recorded step"):
         Session.open(tmp_path).steps()
 
@@ -405,5 +407,7 @@ def test_metadata_that_changed_is_seen_even_in_a_session_of_one_segment(tmp_path
 def test_compressed_chunks_are_read_message_by_message(tmp_path):
     write_items(tmp_path, [batch(second, air(20.0, second)) for second in range(20)], compression=CompressionType.ZSTD)
     path = tmp_path / TELEMETRY / "0000.mcap"
-    assert [m.time_ns for m in telemetry_messages(path, lambda channel: True)] == [at(second) for second in range(20)]
-    assert list(telemetry_messages(path, lambda channel: False)) == []
+    assert [m.time_ns for m in read_telemetry_messages(path, lambda channel: True)] == [
+        at(second) for second in range(20)
+    ]
+    assert list(read_telemetry_messages(path, lambda channel: False)) == []

@@ -152,11 +152,11 @@ async def test_flushed_returns_when_all_before_it_is_on_the_disk_without_a_wait_
         hub.publish(frame(START_NS + index, index))
         hub.publish(Event(START_NS + index, "info", "note", f"second {index}"))
     assert recorder.saved == Saved(0, 0, 0)
-    await recorder.flushed()
+    await recorder.flush()
     assert recorder.saved == Saved(12, 24, 0)  # two messages for each event
     assert clock.now_ns() == START_NS
     assert len(list(committed_event_texts(tmp_path / "s"))) == 12
-    await recorder.flushed()
+    await recorder.flush()
     await stop(tasks)
     await recorder.finish()
     assert Session.open(tmp_path / "s").frame_count == 12
@@ -165,7 +165,7 @@ async def test_flushed_returns_when_all_before_it_is_on_the_disk_without_a_wait_
 async def test_frames_are_finished_in_time_also_when_no_more_come(tmp_path):
     recorder, clock, hub, tasks = await start(tmp_path / "s", replace(SETTINGS, segment_s=10.0))
     hub.publish(frame(START_NS, 0))
-    await recorder.flushed()
+    await recorder.flush()
     assert [path.name for path in (tmp_path / "s" / "frames").iterdir()] == ["0000.mcap.part"]
     await clock.sleep_until(START_NS + 12 * NS_PER_S)
     assert [path.name for path in (tmp_path / "s" / "frames").iterdir()] == ["0000.mcap"]

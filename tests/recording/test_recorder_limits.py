@@ -20,7 +20,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.notices import Losses, ranges
+from thermostand.recording.writing.notices import FrameLosses, format_ranges
 from thermostand.recording.writing.recorder import Saved
 
 
@@ -93,7 +93,7 @@ async def test_flushed_waits_for_telemetry_the_disk_refuses(tmp_path, files_limi
     recorder, clock, hub, tasks = await start(tmp_path / "s", SETTINGS)
     at(1)
     hub.publish(Event(START_NS, "info", "note", "kept in memory"))
-    waiting = asyncio.create_task(recorder.flushed())
+    waiting = asyncio.create_task(recorder.flush())
     await clock.sleep_until(START_NS + 3 * NS_PER_S)
     assert not waiting.done()
     at(2)
@@ -107,7 +107,7 @@ async def test_frames_that_did_not_fit_the_queue_are_lost(tmp_path):
     recorder, _, hub, tasks = await start(tmp_path / "s", replace(SETTINGS, queue_frames=3))
     for index in range(10):
         hub.publish(frame(START_NS + index, index))
-    await recorder.flushed()
+    await recorder.flush()
     assert recorder.saved == Saved(3, 0, 7)
     await stop(tasks)
     await recorder.finish()
@@ -122,7 +122,7 @@ async def test_a_frame_that_cannot_be_encoded_is_lost_and_the_next_one_is_not(tm
     recorder, _, hub, tasks = await start(tmp_path / "s", SETTINGS, prepare)
     for index in range(3):
         hub.publish(frame(START_NS + index, index))
-    await recorder.flushed()
+    await recorder.flush()
     assert recorder.saved == Saved(2, 0, 1)
     await stop(tasks)
     await recorder.finish()
@@ -158,11 +158,11 @@ async def test_on_a_nearly_full_disk_not_even_the_first_frame_is_taken(tmp_path)
     ],
 )
 def test_every_lost_block_is_named(blocks, text):
-    assert ranges(blocks) == text
+    assert format_ranges(blocks) == text
 
 
 def test_losses_are_reported_by_reason_and_step():
-    losses = Losses()
+    losses = FrameLosses()
     for block_id, step_id, reason in [(1, "a", "slow"), (2, "a", "slow"), (4, "b", "slow"), (5, "", "full")]:
         losses.count(replace(frame(START_NS, block_id), step_id=step_id), reason)
     assert losses.total == 4

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from tests.recording.disks import tmpfs
-from tests.recording.recorded import (
+from tests.recording.full_session import (
     ATTACHMENTS,
     DEVICES,
     MS,
     START_NS,
     frame_key,
-    half_second,
     images,
     item_key,
+    make_half_second,
     record,
     telemetry,
 )
@@ -23,7 +23,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Frame
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
-from thermostand.recording.exporting.topics import recorded_topics
+from thermostand.recording.exporting.topics import list_topics
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.session import Session
 
@@ -50,10 +50,10 @@ async def test_subscribers_see_the_items_as_they_were_published(tmp_path):
 
 
 def deep(time_ns, index):
-    yield from half_second(time_ns, index, np.uint16)
+    yield from make_half_second(time_ns, index, np.uint16)
 
 
-@pytest.mark.parametrize(("items", "encoding"), [(half_second, "zstd"), (half_second, "raw"), (deep, "zstd")])
+@pytest.mark.parametrize(("items", "encoding"), [(make_half_second, "zstd"), (make_half_second, "raw"), (deep, "zstd")])
 async def test_a_recorded_replay_is_the_same_session(tmp_path, items, encoding):
     await record(tmp_path / "s", items=items, encoding=encoding)
     original = Session.open(tmp_path / "s")
@@ -66,13 +66,13 @@ async def test_a_recorded_replay_is_the_same_session(tmp_path, items, encoding):
     assert copy.metadata == original.metadata
     assert dict(copy.attachments) == ATTACHMENTS
     assert copy.channels() == original.channels()
-    assert recorded_topics(copy) == recorded_topics(original)
+    assert list_topics(copy) == list_topics(original)
     assert [path.name for path in (tmp_path / "copies").iterdir()] == ["r"]
 
 
 async def test_frames_of_which_only_windows_are_real_stay_so(tmp_path):
     def items(time_ns, index):
-        for item in half_second(time_ns, index):
+        for item in make_half_second(time_ns, index):
             if isinstance(item, Frame) and index % 2:
                 windows = np.array([[3, 4, 10, 11]], np.int32)
                 image = np.full_like(item.image, 90)
@@ -190,7 +190,7 @@ async def test_a_copy_on_a_disk_that_is_nearly_full_is_the_same_session(tmp_path
 
 async def test_a_copy_that_would_lack_frames_does_not_appear(tmp_path):
     def items(time_ns, index):
-        for item in half_second(time_ns, index):
+        for item in make_half_second(time_ns, index):
             noise = np.random.default_rng(index).integers(0, 255, (400, 500), np.uint8)
             yield replace(item, image=noise) if isinstance(item, Frame) else item
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from tests.recording.damage import (
     ATTACHMENTS,
     DAMAGES,
@@ -17,13 +17,13 @@ from tests.recording.damage import (
     read_segment,
     write_segment,
 )
-from thermostand.recording.format.layout import FRAMES, TELEMETRY, segment_metadata
+from thermostand.recording.format.layout import FRAMES, TELEMETRY, make_segment_metadata
 from thermostand.recording.format.records import read_head
 from thermostand.recording.reading.scan import Severity, verify
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.salvage import salvage_line, salvage_session
+from thermostand.recording.repair.salvage import format_salvaged, salvage_session
 
-TRIALS = [15, by_night(1000)]
+TRIALS = [15, mark_nightly(1000)]
 """Places at which a file is damaged, by day and by night."""
 SERIES = [TELEMETRY, FRAMES]
 
@@ -64,7 +64,7 @@ def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, night, earlier, s
         assert read_segment(done.path) == written.untouched(data), f"{begin} to {to}"
 
 
-@pytest.mark.parametrize("trials", [8, by_night(300)])
+@pytest.mark.parametrize("trials", [8, mark_nightly(300)])
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
 def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, night, series, damage, trials):
@@ -125,7 +125,7 @@ def test_what_was_wrong_and_what_became_of_it_is_said(damaged):
     folder, _, _ = damaged(FRAMES, hole(9000, 9100))
     (done,) = salvage_session(folder.parent)
     assert re.match(rf"1 damaged place of {done.lost_bytes} bytes, .* byte \d+$", done.reason)
-    said = salvage_line(done)
+    said = format_salvaged(done)
     assert f"{done.messages} messages in 0001.mcap, {done.lost_bytes} bytes lost" in said
     folder, _, _ = damaged(FRAMES, lambda data: hole(9000, 9100)(hole(30_000, 30_100)(data)))
     (done,) = salvage_session(folder.parent)
@@ -133,7 +133,7 @@ def test_what_was_wrong_and_what_became_of_it_is_said(damaged):
     folder, _, _ = damaged(FRAMES, lambda data: data[:-160])
     (done,) = salvage_session(folder.parent)
     assert re.match(r"a block of \d+ bytes", done.reason)
-    assert salvage_line(done).endswith(f"0001.mcap.part: 46 messages in 0001.mcap ({done.reason})")
+    assert format_salvaged(done).endswith(f"0001.mcap.part: 46 messages in 0001.mcap ({done.reason})")
 
 
 def test_a_second_damaged_original_of_a_number_gets_a_name_of_its_own(damaged):
@@ -214,7 +214,7 @@ def test_metadata_is_voted_on(damaged):
 @pytest.mark.parametrize("series", SERIES)
 @pytest.mark.parametrize("record", ["session", "segment"])
 def test_a_flipped_letter_in_the_metadata_of_a_finished_segment_is_repaired(damaged, series, record):
-    crc = segment_metadata(series, 0, METADATA)["session_crc32"].encode()
+    crc = make_segment_metadata(series, 0, METADATA)["session_crc32"].encode()
     damage = {"session": (b"night-1", b"night-3"), "segment": (crc, crc[:-1] + b"g")}[record]
     folder, path, written = damaged(series, lambda data: data.replace(*damage, 1), "finished")
     salvaged = {done.source: done for done in salvage_session(folder.parent)}

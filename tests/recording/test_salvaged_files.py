@@ -20,7 +20,7 @@ from tests.recording.damage import (
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
-from thermostand.recording.repair.salvage import BEING_RECORDED, salvage_line, salvage_session, salvage_unfinished
+from thermostand.recording.repair.salvage import BEING_RECORDED, format_salvaged, salvage_session, salvage_unfinished
 from thermostand.recording.writing.segment import CommitSink
 
 SERIES = [TELEMETRY, FRAMES]
@@ -118,7 +118,7 @@ def test_a_living_recording_is_left_alone(damaged):
         fcntl.flock(file, fcntl.LOCK_EX)
         (done,) = salvage_session(folder.parent)
         assert (done.source, done.path, done.reason) == (path, None, BEING_RECORDED)
-        assert salvage_line(done).endswith("it is being recorded")
+        assert format_salvaged(done).endswith("it is being recorded")
         assert path.read_bytes() == written.data[:-5]
     (done,) = salvage_session(folder.parent)
     assert done.path == folder / "0001.mcap"

@@ -14,11 +14,11 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 
 from tests.recording.disks import ext4, limit_files, run, tmpfs
-from thermostand.recording.format.layout import segment_metadata
+from thermostand.recording.format.layout import make_segment_metadata
 from thermostand.recording.format.messages import CLASSES, EVENT, LOG
-from thermostand.recording.writing.homes import FolderLost
-from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic, merge_chunks
-from thermostand.recording.writing.series import Series, next_number
+from thermostand.recording.writing.folder_watch import FolderLost
+from thermostand.recording.writing.segment import MessageRecord, SeriesSpec, Topic, merge_chunks
+from thermostand.recording.writing.series import Series, find_next_number
 
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
 SESSION = {"session_id": "night-1"}
@@ -36,7 +36,7 @@ def form(**changes):
         "segment_ns": 1 << 60,
         "merge_chunks": True,
     }
-    return SeriesForm(**{**fields, **changes})
+    return SeriesSpec(**{**fields, **changes})
 
 
 def records(commit, size_bytes=60):
@@ -105,7 +105,7 @@ def test_a_finished_segment_has_few_large_chunks_with_everything_in_its_place(tm
         assert {found.name: found.data.decode() for found in reader.iter_attachments()} == ATTACHMENTS
         metadata = {found.name: found.metadata for found in reader.iter_metadata()}
         assert metadata["session"] == SESSION
-        assert metadata["segment"] == segment_metadata("telemetry", 0, metadata["session"])
+        assert metadata["segment"] == make_segment_metadata("telemetry", 0, metadata["session"])
         summary = reader.get_summary()
     assert summary.statistics.message_count == 600 * RECORDS_PER_COMMIT
     assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
@@ -146,16 +146,16 @@ def test_a_file_that_is_no_mcap_is_not_merged_and_says_so(tmp_path):
 def test_a_name_that_is_taken_is_not_used_again_whatever_it_ends_in(tmp_path):
     for name, number in (("0003.mcap.damaged", 4), ("0004.mcap.tmp", 5), ("0007.mcap.part", 8), ("0006.mcap", 8)):
         (tmp_path / name).touch()
-        assert next_number(tmp_path) == number
+        assert find_next_number(tmp_path) == number
     (tmp_path / "notes.txt").touch()
-    assert next_number(tmp_path) == 8
+    assert find_next_number(tmp_path) == 8
 
 
 def test_a_file_under_a_number_far_outside_does_not_count(tmp_path):
     """Twelve digits are no segment for a salvage: what would be written behind it could be lost."""
     for name in ("0000.mcap", "0003.mcap.part", "99999999999.mcap", f"{'9' * 200}.mcap"):
         (tmp_path / name).touch()
-    assert next_number(tmp_path) == 4
+    assert find_next_number(tmp_path) == 4
 
 
 def test_no_next_segment_is_begun_while_a_refused_block_may_still_be_in_the_last_one(tmp_path, limited):
@@ -193,7 +193,7 @@ def test_a_folder_that_was_removed_is_made_again_only_when_asked_and_its_numbers
         with pytest.raises(FolderLost, match="was removed while"):
             series.commit(records(2), 0)
         assert not folder.exists()
-    assert not series.refound()
+    assert not series.recover()
     series.commit(records(2), 0)
     assert series.finish()
     assert [path.name for path in folder.iterdir()] == ["0002.mcap"]
@@ -212,7 +212,7 @@ def test_a_folder_that_was_renamed_is_written_into_again_when_it_is_back(tmp_pat
         series.commit(records(1), 0)
     folder.rmdir()
     other.rename(folder)
-    assert series.refound()
+    assert series.recover()
     series.commit(records(1), 0)
     assert series.finish()
     assert messages(folder / "0000.mcap") == records(0) + records(1)
@@ -224,7 +224,7 @@ def test_a_new_folder_leaves_the_renamed_one_to_a_salvage(tmp_path):
     series = Series(folder, form(reserve_bytes=1_000_000))
     series.commit(records(0), 0)
     folder.rename(other)
-    assert not series.refound()
+    assert not series.recover()
     series.commit(records(1), 0)
     assert series.finish()
     assert [path.name for path in folder.iterdir()] == ["0001.mcap"]

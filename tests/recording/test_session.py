@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from tests.recording.declared import form as declared_form
-from tests.recording.stored import CAMERA_TOPICS, stored
+from tests.recording.device_declarations import form as declared_form
+from tests.recording.frame_records import CAMERA_TOPICS, make_frame_records
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
@@ -14,22 +14,22 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format import messages
 from thermostand.recording.format.layout import FORMAT, FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
-from thermostand.recording.writing.forms import readings_topic
-from thermostand.recording.writing.segment import MessageRecord, SeriesForm, Topic
+from thermostand.recording.writing.segment import MessageRecord, SeriesSpec, Topic
 from thermostand.recording.writing.series import Series
+from thermostand.recording.writing.session_spec import make_readings_topic
 
 START_NS = 1_767_290_400 * NS_PER_S
 METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n", "target.yaml": "rows: 6\n"}
 ENCODER = declared_form("thermometers")
 TELEMETRY_TOPICS = (
-    readings_topic(ENCODER),
+    make_readings_topic(ENCODER),
     *(Topic(name, messages.CLASSES[name]) for name in (messages.STEP, messages.EVENT)),
 )
 
 
 def form(name, topics, compression, metadata=METADATA):
-    return SeriesForm(name, topics, compression, metadata, ATTACHMENTS, 1_000_000_000, 600 * NS_PER_S)
+    return SeriesSpec(name, topics, compression, metadata, ATTACHMENTS, 1_000_000_000, 600 * NS_PER_S)
 
 
 def telemetry_of(second):
@@ -64,7 +64,7 @@ def write_series(folder, seconds, series_form, records_of):
 
 def write_frames(directory, seconds, metadata=METADATA):
     series_form = form(FRAMES, CAMERA_TOPICS, CompressionType.ZSTD, metadata)
-    write_series(directory / FRAMES, seconds, series_form, lambda k: stored(frame(k)))
+    write_series(directory / FRAMES, seconds, series_form, lambda k: make_frame_records(frame(k)))
 
 
 def write_telemetry(directory, seconds, metadata=METADATA):

@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from tests.recording.disks import ext4, limit_files, mounted, run, tmpfs
+from tests.recording.disks import ext4, limit_files, mount, run, tmpfs
 from thermostand.recording.writing.segment import CommitSink
 
 MB = 1_000_000
@@ -72,8 +72,8 @@ def test_a_block_the_disk_refuses_is_cut_off_again_and_the_reserve_with_it(disk,
 
 
 def test_a_reserve_that_does_not_fit_is_an_error_at_once_and_leaves_nothing(tmp_path):
-    for mount in (lambda: ext4(tmp_path / "a", 64 << 20), lambda: tmpfs(tmp_path / "b", "64m")):
-        with mount() as folder:
+    for mounted in (lambda: ext4(tmp_path / "a", 64 << 20), lambda: tmpfs(tmp_path / "b", "64m")):
+        with mounted() as folder:
             free_bytes = os.statvfs(folder).f_bfree
             with pytest.raises(OSError, match="to reserve 200 MB") as caught:
                 CommitSink(folder / "file", 200 * MB)
@@ -84,7 +84,7 @@ def test_a_reserve_that_does_not_fit_is_an_error_at_once_and_leaves_nothing(tmp_
 
 def test_a_disk_that_cannot_reserve_is_written_to_all_the_same(tmp_path):
     """Linux has no fallocate on ramfs."""
-    with mounted(tmp_path / "disk", "-t", "ramfs", "ramfs") as folder:
+    with mount(tmp_path / "disk", "-t", "ramfs", "ramfs") as folder:
         sink = CommitSink(folder / "file", 20 * MB)
         sink.append([b"a" * 1000])
         sink.settle()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tests.recording.recorded import INFO, MS, START_NS, frame, half_second, images, record, telemetry
+from tests.recording.full_session import INFO, MS, START_NS, frame, images, make_half_second, record, telemetry
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import TRIMMED
@@ -63,7 +63,7 @@ async def test_the_begin_belongs_to_a_part_and_the_end_does_not(tmp_path):
 
 def soak(time_ns, index):
     """A step from the second half second to the fifth."""
-    yield from (item for item in half_second(time_ns, index) if not isinstance(item, StepMark))
+    yield from (item for item in make_half_second(time_ns, index) if not isinstance(item, StepMark))
     if index in (1, 4):
         state = StepState.STARTED if index == 1 else StepState.DONE
         yield StepMark(time_ns, "cycle/soak-30", 7, "soak", state, {"soak_s": 1.5})

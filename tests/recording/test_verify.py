@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from mcap.reader import SeekingReader
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
-from thermostand.recording.format.inventory import inventory
-from thermostand.recording.format.records import frame_places
-from thermostand.recording.reading.gaps import silences
+from thermostand.recording.format.inventory import list_segments
+from thermostand.recording.format.records import list_frame_places
+from thermostand.recording.reading.gaps import find_silences
 from thermostand.recording.reading.scan import Severity, verify
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
 
 from .damage import unlist
-from .recorded import item_key, record
+from .full_session import item_key, record
 
 SECONDS = 12
 
@@ -82,7 +82,7 @@ def everything(directory):
         return None
 
 
-@pytest.mark.parametrize("trials", [80, by_night(400)])
+@pytest.mark.parametrize("trials", [80, mark_nightly(400)])
 async def test_one_flipped_bit_anywhere_is_found_or_changes_nothing(session, trials):
     whole = everything(session)
     randomly = random.Random(5)
@@ -103,7 +103,7 @@ async def test_one_flipped_bit_anywhere_is_found_or_changes_nothing(session, tri
     assert errors(session) == []
 
 
-@pytest.mark.parametrize("every", [13, by_night(1)])
+@pytest.mark.parametrize("every", [13, mark_nightly(1)])
 async def test_every_byte_is_guarded_but_the_name_of_the_writers_library(tmp_path, every):
     directory = tmp_path / "s"
     await record(directory, 1, items=second, encoding="raw", period_ns=NS_PER_S)
@@ -166,7 +166,7 @@ async def test_frames_that_went_with_a_segment_are_counted(session):
 async def test_frames_in_a_damaged_chunk_are_not_called_missing_as_well(session):
     path = session / "frames" / "0001.mcap"
     data = bytearray(path.read_bytes())
-    data[frame_places(path)[1].chunk.offset + 150] ^= 1
+    data[list_frame_places(path)[1].chunk.offset + 150] ^= 1
     path.write_bytes(data)
     (text,) = errors(session)
     assert text.startswith("error: frames/0001.mcap: is damaged: ")
@@ -207,7 +207,7 @@ async def test_an_original_from_which_everything_was_recovered_is_a_note(session
 async def test_an_original_from_which_something_is_lost_stays_an_error(session):
     path = session / "frames" / "0001.mcap"
     data = bytearray(path.read_bytes())
-    data[frame_places(path)[1].chunk.offset + 150] ^= 1
+    data[list_frame_places(path)[1].chunk.offset + 150] ^= 1
     path.write_bytes(data)
     salvage_session(session)
     with_a_damaged_index(path)
@@ -235,7 +235,7 @@ async def test_a_segment_that_is_being_recorded_is_no_error(session):
         assert errors(session) == []
         (note,) = notes(session)
         assert note.startswith(f"note: frames/{part.name}: is being recorded")
-        assert [str(entry.state) for entry in inventory(session)].count("recording") == 1
+        assert [str(entry.state) for entry in list_segments(session)].count("recording") == 1
 
 
 def as_left(path):
@@ -328,7 +328,7 @@ def every(period_s, *stretches):
 
 
 def test_devices_with_different_periods_fall_silent_together():
-    found = silences(
+    found = find_silences(
         {
             "thermometers.air": every(5, (0, 600), (900, 1500)),
             "thermometers.artifact": every(5, (0, 600), (900, 1500)),
@@ -341,7 +341,7 @@ def test_devices_with_different_periods_fall_silent_together():
 
 
 def test_a_channel_of_a_device_that_stops_early_or_begins_late_is_named_alone():
-    found = silences(
+    found = find_silences(
         {
             "thermometers.air": every(1, (0, 100)),
             "thermometers.artifact": every(1, (0, 40)),
@@ -355,8 +355,8 @@ def test_a_channel_of_a_device_that_stops_early_or_begins_late_is_named_alone():
 
 
 def test_slow_but_even_channels_and_single_readings_are_no_gaps():
-    assert silences({"linear.position": every(30, (0, 600)), "flap.position": np.array([5], np.int64)}) == []
-    assert silences({}) == []
+    assert find_silences({"linear.position": every(30, (0, 600)), "flap.position": np.array([5], np.int64)}) == []
+    assert find_silences({}) == []
 
 
 def test_a_folder_without_segments_is_no_session(tmp_path):

@@ -20,7 +20,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
-from tests.recording.recorded import ATTACHMENTS, INFO, half_second, record
+from tests.recording.full_session import ATTACHMENTS, INFO, make_half_second, record
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading
 from thermostand.recording.format import messages
@@ -32,7 +32,7 @@ FOXGLOVE = {message.DESCRIPTOR.full_name: message for message in (CompressedImag
 
 def everything(time_ns, index, *details):
     """Something on every topic."""
-    yield from half_second(time_ns, index, *details)
+    yield from make_half_second(time_ns, index, *details)
     yield Batch("camera", time_ns, (Reading("camera.temperature", 40.0, "degC", time_ns),))
 
 

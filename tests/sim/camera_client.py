@@ -7,18 +7,18 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.addresses import camera_address
+from tests.addresses import allocate_camera_address
 from tests.sim.gvcp_client import Packet, decode_ack, decode_leader, decode_packet, pack_read_memory
 from tests.still_plant import StillPlant
 from thermostand.drivers.sim.gige import gvcp
-from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.genicam import make_features
 from thermostand.drivers.sim.gige.gvcp import Ack, GvcpCommand, GvcpRequest, GvcpStatus, Resend
 from thermostand.drivers.sim.gige.gvsp import PacketKind
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 
 WIDTH, HEIGHT = 320, 240
-START_NS = seconds_ns(1_700_000_000.0)
-FEATURES = {feature.name: feature for feature in features(WIDTH, HEIGHT, "SN1")}
+START_NS = to_ns(1_700_000_000.0)
+FEATURES = {feature.name: feature for feature in make_features(WIDTH, HEIGHT, "SN1")}
 WAIT_s = 5.0
 SILENCE_s = 0.1
 
@@ -26,7 +26,7 @@ SILENCE_s = 0.1
 @cache
 def address() -> str:
     """Of the camera, in this process."""
-    return camera_address()
+    return allocate_camera_address()
 
 
 def still_plant() -> StillPlant:
@@ -126,4 +126,4 @@ def image_of(packets: list[Packet]) -> NDArray[np.uint8]:
 
 
 def expected(start_s: float, exposure_s: float = 0.1, gain_dB: float = 0.0) -> NDArray[np.uint8]:
-    return render(START_NS + seconds_ns(start_s + exposure_s / 2), exposure_s, gain_dB)
+    return render(START_NS + to_ns(start_s + exposure_s / 2), exposure_s, gain_dB)

@@ -2,7 +2,7 @@ import pytest
 
 from thermostand.drivers.sim.gige.camera import Exposure, Schedule
 from thermostand.drivers.sim.gige.camera_registers import Registers
-from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.genicam import make_features
 
 MS = 1_000_000
 SOFTWARE, LINE0 = 0, 1
@@ -11,7 +11,7 @@ SOFTWARE, LINE0 = 0, 1
 @pytest.fixture
 def registers() -> Registers:
     """2 frames a second, 100 ms of exposure."""
-    registers = Registers(features(64, 48, "SN1"), "127.0.0.71", "SN1")
+    registers = Registers(make_features(64, 48, "SN1"), "127.0.0.71", "SN1")
     registers.put("ExposureTime", 100_000.0)
     registers.put("AcquisitionFrameRate", 2.0)
     registers.put("AcquisitionFrameRateEnable", 1)

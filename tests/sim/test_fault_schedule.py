@@ -9,14 +9,21 @@ from typing import Any, cast
 
 import pytest
 
-from tests.addresses import camera_address
+from tests.addresses import allocate_camera_address
 from thermostand.drivers.sim.control import Control
 from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
-from thermostand.drivers.sim.laboratory_faults import FAULTS, FaultSchedule, PlannedFault, inject, known_to, parse_fault
+from thermostand.drivers.sim.laboratory_faults import (
+    FAULTS,
+    FaultSchedule,
+    PlannedFault,
+    inject,
+    list_known_faults,
+    parse_fault,
+)
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.simulator import laboratory_of
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.simulator import describe_laboratory
 
 START_NS = 1_767_290_400_000_000_000
 S = 1_000_000_000
@@ -27,8 +34,8 @@ CHAMBER = {"protocol": "espec", "address": "tcp:127.0.0.1:0", "unit": 1, "limits
 
 @pytest.fixture(params=[None, CHAMBER], ids=["regulator", "chamber"])
 def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Laboratory]:
-    config = load_config(packaged("", "simulated"))
-    described = laboratory_of(config, virtual=True, seed=None, start_ns=START_NS, is_anywhere=True)
+    config = load_config(find_packaged("", "simulated"))
+    described = describe_laboratory(config, virtual=True, seed=None, start_ns=START_NS, is_anywhere=True)
     devices = cast("dict[str, Any]", described["devices"])
     if request.param is not None:
         devices["chamber"] = {"fake": "climate_chamber.espec", "settings": request.param}
@@ -39,7 +46,7 @@ def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Labor
         "settings": {"protocol": "hart", "serial_number": None, "address": "tcp:127.0.0.1:0"},
     }
     devices["linear"]["settings"]["address"] = f"serial:{tmp_path / 'linear'}"
-    devices["camera"]["settings"]["address"] = camera_address()
+    devices["camera"]["settings"]["address"] = allocate_camera_address()
     built = Laboratory(parse_document(json.dumps(described), LaboratorySpec, "laboratory"))
     yield built
     built.close()
@@ -89,8 +96,8 @@ def test_each_fault_of_the_table_is_set_and_mended(laboratory: Laboratory):
 def test_every_line_of_the_stand_has_the_faults_of_a_link(laboratory: Laboratory):
     with pytest.raises(ConfigError, match=r"no reference\.drop"):
         parse_fault("reference.drop=0.5")
-    schedule = FaultSchedule(laboratory, [parse_fault("reference.drop=0.5", known_to(laboratory))])
-    assert schedule.standing() == {"reference.drop": 0.5}
+    schedule = FaultSchedule(laboratory, [parse_fault("reference.drop=0.5", list_known_faults(laboratory))])
+    assert schedule.list_standing() == {"reference.drop": 0.5}
     assert laboratory.link("reference").faults.drop == 0.5
     schedule.mend("reference.drop")
     assert laboratory.link("reference").faults.drop == 0.0
@@ -122,7 +129,7 @@ def test_a_plan_for_a_device_that_is_not_there_is_refused(laboratory: Laboratory
     for text in ("rotary.restart", "axis.alarm=rotary@2h", 'thermometer.offset_K={"roof": 1}@10'):
         with pytest.raises(ConfigError, match=r"rotary|roof"):
             FaultSchedule(laboratory, [parse_fault(text)])
-    assert FaultSchedule(laboratory, [parse_fault("bus.unplugged@3:4")]).standing() == {}
+    assert FaultSchedule(laboratory, [parse_fault("bus.unplugged@3:4")]).list_standing() == {}
     assert not laboratory.link("bus").faults.silent
 
 

@@ -6,10 +6,10 @@ import pytest
 
 from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera_registers import Registers
-from thermostand.drivers.sim.gige.genicam import Feature, features, to_xml
+from thermostand.drivers.sim.gige.genicam import Feature, make_features, to_xml
 
 SPACE = "{http://www.genicam.org/GenApi/Version_1_1}"
-TABLE = features(64, 48, "SN1")
+TABLE = make_features(64, 48, "SN1")
 BY_NAME = {feature.name: feature for feature in TABLE}
 REFERENCES = ("pFeature", "pValue", "pMax", "pSelected", "pVariable", "pIsLocked", "pPort")
 

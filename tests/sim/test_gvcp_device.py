@@ -3,7 +3,7 @@ import pytest
 from tests.sim.gvcp_client import decode_ack, pack_read_memory, pack_words
 from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera_registers import CCP, ControlChannel, Registers
-from thermostand.drivers.sim.gige.genicam import features
+from thermostand.drivers.sim.gige.genicam import make_features
 from thermostand.drivers.sim.gige.gvcp import Ack, GvcpCommand, GvcpRequest, GvcpStatus, Nack, Resend
 
 ALICE, BOB = ("127.0.0.1", 40001), ("127.0.0.1", 40002)
@@ -36,7 +36,7 @@ class Wire:
 
     def __init__(self) -> None:
         self.device = RecordingDevice()
-        self.registers = Registers(features(64, 48, "SN1"), "127.0.0.71", "SN1")
+        self.registers = Registers(make_features(64, 48, "SN1"), "127.0.0.71", "SN1")
         self.channel = ControlChannel(self.registers, self.device)
         self.now_s = 0.0
         self.req_id = 0

@@ -22,7 +22,7 @@ LEADER_BYTES = bytes.fromhex("0000 0001 0102030405060708 01080001 00000040 00000
 def test_the_header_is_these_bytes(
     wire: str, kind: PacketKind, block_id: int, packet_id: int, status: int, extended: bool
 ) -> None:
-    assert gvsp.header(kind, block_id, packet_id, status, extended) == bytes.fromhex(wire)
+    assert gvsp.make_header(kind, block_id, packet_id, status, extended) == bytes.fromhex(wire)
 
 
 def test_the_leader_is_these_36_bytes() -> None:

@@ -15,11 +15,11 @@ from thermostand.drivers.sim.physics.optics import (
     Nodes,
     Optics,
     StandPlacement,
-    marker_centres_mm,
-    optics_at,
+    compute_optics_at,
+    compute_strain,
+    compute_true_centres_px,
+    make_marker_centres_mm,
     project,
-    strain,
-    true_centres_px,
 )
 from thermostand.drivers.sim.physics.plant import NS_PER_S, Plant, PlantSpec
 
@@ -49,23 +49,23 @@ def test_a_pixel_is_114_micrometres_of_the_target():
 
 
 def test_marker_1_is_bottom_left_and_numbers_run_along_the_long_side():
-    centres = true_centres_px(optics_at("modified", COLD, StandPlacement()))
+    centres = compute_true_centres_px(compute_optics_at("modified", COLD, StandPlacement()))
     assert centres.shape == (54, 2)
     assert centres[0, 0] < centres[8, 0]
     assert centres[0, 1] > centres[45, 1]
-    assert marker_centres_mm()[[0, 1, 9]].tolist() == [[-120.0, -75.0], [-90.0, -75.0], [-120.0, -45.0]]
+    assert make_marker_centres_mm()[[0, 1, 9]].tolist() == [[-120.0, -75.0], [-90.0, -75.0], [-120.0, -45.0]]
     assert (centres > 40.0).all()
     assert (centres < (2448 - 40, 2048 - 40)).all()
 
 
 def test_moving_the_target_away_shrinks_it_about_the_principal_point():
     far = replace(PLAIN, target_centre_mm=(0.0, 0.0, 1652.0))
-    points = marker_centres_mm()
+    points = make_marker_centres_mm()
     assert project(far, points) - (1223.5, 1023.5) == pytest.approx((project(PLAIN, points) - (1223.5, 1023.5)) / 2)
 
 
 def test_a_positive_rotary_angle_turns_the_right_edge_away():
-    turned = optics_at(
+    turned = compute_optics_at(
         "modified", COLD, StandPlacement(rotary_deg=20.0, target_offset_mm=(0.0, 0.0), target_roll_deg=0.0)
     )
     point = project(replace(turned, k1=0.0), np.array([[100.0, 0.0]]))[0]
@@ -93,11 +93,11 @@ def test_distortion_and_sensor_tilt_follow_their_definitions():
 
 def test_the_centroid_of_a_tilted_disc_is_the_centre_of_its_image_ellipse():
     turned = replace(PLAIN, target_turn_rad=math.radians(30.0))
-    centres = true_centres_px(turned)
+    centres = compute_true_centres_px(turned)
     for marker in (0, 26, 53):
-        x, y = marker_centres_mm()[marker]
+        x, y = make_marker_centres_mm()[marker]
         assert centres[marker] == pytest.approx(_ellipse_centre(turned, x, y), abs=2e-5)
-    eccentricity_px = np.abs(centres - project(turned, marker_centres_mm())).max()
+    eccentricity_px = np.abs(centres - project(turned, make_marker_centres_mm())).max()
     assert 0.005 < eccentricity_px < 0.1
 
 
@@ -114,14 +114,14 @@ def _ellipse_centre(optics: Optics, x_mm: float, y_mm: float, radius_mm: float =
 
 
 def test_solids_expand_by_their_coefficient_and_a_little_faster_when_warm():
-    assert strain(24.0, 23e-6, 320.0) == 0.0
-    assert strain(25.0, 23e-6, 320.0) - strain(23.0, 23e-6, 320.0) == pytest.approx(46e-6, rel=1e-4)
-    assert strain(54.0, 23e-6, 1000.0) > -strain(-6.0, 23e-6, 1000.0)
+    assert compute_strain(24.0, 23e-6, 320.0) == 0.0
+    assert compute_strain(25.0, 23e-6, 320.0) - compute_strain(23.0, 23e-6, 320.0) == pytest.approx(46e-6, rel=1e-4)
+    assert compute_strain(54.0, 23e-6, 1000.0) > -compute_strain(-6.0, 23e-6, 1000.0)
 
 
 def test_the_glass_target_grows_with_its_own_temperature():
-    warm = true_centres_px(optics_at("modified", replace(COLD, artifact_degC=34.0), StandPlacement()))
-    cold = true_centres_px(optics_at("modified", COLD, StandPlacement()))
+    warm = compute_true_centres_px(compute_optics_at("modified", replace(COLD, artifact_degC=34.0), StandPlacement()))
+    cold = compute_true_centres_px(compute_optics_at("modified", COLD, StandPlacement()))
     width_change = np.ptp(warm[:9, 0]) / np.ptp(cold[:9, 0]) - 1.0
     assert width_change == pytest.approx(9.0e-5, rel=0.03)
 
@@ -148,7 +148,7 @@ def live_through(kind: CameraKind, roll_deg: float = 0.0, cycle_degC: tuple[int,
 
     def seen(minutes: int) -> NDArray[np.float64]:
         plant.advance(plant.now_ns + minutes * MINUTE_ns)
-        return true_centres_px(plant.optics(plant.now_ns))
+        return compute_true_centres_px(plant.optics(plant.now_ns))
 
     plant.on_step.append(pin)
     cold = seen(0)
@@ -203,7 +203,7 @@ def test_a_longer_soak_closes_the_modified_cameras_loop():
     for hot_degC in (24.0, 44.0, 24.0):
         plant.on_step[:] = [lambda time_ns, dt_s, degC=hot_degC: _pin(plant, degC)]
         plant.advance(plant.now_ns + 12 * 60 * MINUTE_ns)
-        centres.append(true_centres_px(plant.optics(plant.now_ns)))
+        centres.append(compute_true_centres_px(plant.optics(plant.now_ns)))
     assert np.abs(centres[1] - centres[0]).max() > 0.4
     assert np.abs(centres[2] - centres[0]).max() < 0.002
 

@@ -9,8 +9,8 @@ from dataclasses import asdict
 
 import pytest
 
+from thermostand.drivers.sim.physics.hysteresis import BoucWen
 from thermostand.drivers.sim.physics.plant import NS_PER_S, Plant, PlantSpec, STEP_ns
-from thermostand.drivers.sim.physics.wear import BoucWen
 
 START_ns = 1_700_000_000 * NS_PER_S
 MINUTE_ns = 60 * NS_PER_S

@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from thermostand.drivers.sim.physics.optics import Nodes, Optics, StandPlacement, optics_at, true_centres_px
+from thermostand.drivers.sim.physics.optics import (
+    Nodes,
+    Optics,
+    StandPlacement,
+    compute_optics_at,
+    compute_true_centres_px,
+)
 from thermostand.drivers.sim.physics.scene import (
     SceneSpec,
     SimulatedScene,
-    disc_coverages,
-    polygon_coverage,
-    still,
+    compute_disc_coverages,
+    compute_polygon_coverage,
+    make_still,
 )
 
 TIME_ns = 1_700_000_000_000_000_000
@@ -26,7 +32,7 @@ COLD = Nodes(24.0, 24.0, 24.0, 24.0, 24.0, 24.0)
 
 
 def at(linear_mm: float = 0.0, rotary_deg: float = 0.0, roll_deg: float = 0.0) -> Optics:
-    return optics_at("modified", COLD, StandPlacement(linear_mm, rotary_deg, camera_roll_deg=roll_deg))
+    return compute_optics_at("modified", COLD, StandPlacement(linear_mm, rotary_deg, camera_roll_deg=roll_deg))
 
 
 def centroid(weights: NDArray[np.floating]) -> tuple[float, float]:
@@ -41,14 +47,16 @@ def centroid(weights: NDArray[np.floating]) -> tuple[float, float]:
     "optics", [at(), at(25, 8), at(-60, -20), at(140, 30), at(70, 22, 20)], ids=["V0", "V1", "V2", "far", "rolled"]
 )
 def test_rendered_centroids_are_the_true_centres_within_2e_5_px(optics: Optics):
-    for (left, top, coverage), (x, y) in zip(disc_coverages(optics, 1.0), true_centres_px(optics), strict=True):
+    for (left, top, coverage), (x, y) in zip(
+        compute_disc_coverages(optics, 1.0), compute_true_centres_px(optics), strict=True
+    ):
         found_x, found_y = centroid(coverage)
         assert (left + found_x, top + found_y) == pytest.approx((x, y), abs=2e-5)
 
 
 def test_coverage_has_the_discs_area_and_the_edge_spread_of_its_blur():
     optics = at()
-    _, _, coverage = disc_coverages(optics, 1.0)[22]  # in the centre: no distortion
+    _, _, coverage = compute_disc_coverages(optics, 1.0)[22]  # in the centre: no distortion
     scale_px_per_mm = optics.f_px / optics.target_centre_mm[2]
     assert coverage.sum(dtype=np.float64) == pytest.approx(math.pi * (4.0 * scale_px_per_mm) ** 2, rel=2e-3)
     assert coverage.max() == pytest.approx(1.0, abs=1e-5)
@@ -62,7 +70,7 @@ def test_coverage_has_the_discs_area_and_the_edge_spread_of_its_blur():
 
 def test_polygon_coverage_is_exact_for_a_square_between_cells():
     corners = np.array([[1.25, 1.5], [3.25, 1.5], [3.25, 2.75], [1.25, 2.75]])
-    area = polygon_coverage(np.array(list(_short_edges(corners))), width=5, height=4)
+    area = compute_polygon_coverage(np.array(list(_short_edges(corners))), width=5, height=4)
     expected = np.outer([0, 0.5, 0.75, 0], [0, 0.75, 1.0, 0.25, 0])
     assert area == pytest.approx(expected, abs=1e-12)
 
@@ -74,7 +82,7 @@ def _short_edges(corners: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 def test_the_noise_free_image_has_the_specified_levels():
     image = SCENE.noise_free(at(), 0.1, 0.0, 1.0)
-    x, y = np.round(true_centres_px(at())[22]).astype(int)
+    x, y = np.round(compute_true_centres_px(at())[22]).astype(int)
     assert image[5, 5] == pytest.approx(200.0, abs=1e-3)
     assert image[y, x] == pytest.approx(30.0, abs=1e-3)
     assert image.shape == (2048, 2448)
@@ -136,7 +144,7 @@ def test_the_upper_rows_alone_are_those_of_the_whole_frame(rows: int, whole: NDA
 def test_an_overexposed_frame_clips_at_255():
     frame = SCENE.render(at(), TIME_ns, 0.2, 0.0, 1.0)
     assert frame[:50].min() == 255
-    x, y = np.round(true_centres_px(at())[22]).astype(int)
+    x, y = np.round(compute_true_centres_px(at())[22]).astype(int)
     assert frame[y, x] < 80
 
 
@@ -157,7 +165,7 @@ def test_a_half_open_flap_shades_linearly_from_the_top():
 def test_markers_cut_by_the_border_are_drawn_as_far_as_they_reach():
     optics = at(linear_mm=-140.0)
     image = SCENE.noise_free(optics, 0.1, 0.0, 1.0)
-    centres = true_centres_px(optics)
+    centres = compute_true_centres_px(optics)
     assert (centres[:, 0] < 0.0).any()
     edge = centres[(centres[:, 0] > -20.0) & (centres[:, 0] < 20.0)]
     assert len(edge) > 0
@@ -165,7 +173,7 @@ def test_markers_cut_by_the_border_are_drawn_as_far_as_they_reach():
 
 
 def test_a_target_out_of_sight_leaves_the_paper_white():
-    optics = optics_at("modified", COLD, StandPlacement(target_offset_mm=(2000.0, 0.0)))
+    optics = compute_optics_at("modified", COLD, StandPlacement(target_offset_mm=(2000.0, 0.0)))
     assert SCENE.noise_free(optics, 0.1, 0.0, 1.0).min() == pytest.approx(200.0, abs=1e-3)
 
 
@@ -178,7 +186,7 @@ def test_a_still_scene_renders_once_until_another_exposure_is_asked_for():
         asked.append(exposure_s)
         return np.full((rows, 1), len(asked), dtype=np.uint8)
 
-    shown, optics = still(render), at()
+    shown, optics = make_still(render), at()
     pictures = [
         int(shown(optics, TIME_ns + n, exposure_s, 0.0, 1.0, 2)[0, 0])
         for n, exposure_s in enumerate((0.1, 0.1, 0.2, 0.2, 0.1))

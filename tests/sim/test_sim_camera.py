@@ -21,7 +21,7 @@ from thermostand.drivers.sim.gige import gvcp
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvcp import GvcpCommand, GvcpRequest, GvcpStatus
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 
 def test_a_stop_ends_the_frames_and_unlocks_the_settings(client: Client, camera: FakeCamera) -> None:
@@ -60,18 +60,18 @@ def test_without_power_the_camera_is_dead_and_comes_back_with_its_defaults(
     plant.camera_powered = False
     assert client.is_ignored()
     assert not camera.streaming
-    clock.follow(START_NS + seconds_ns(10.0))
+    clock.follow(START_NS + to_ns(10.0))
     plant.camera_powered, plant.camera_power_on_ns = True, clock.now_ns()
     camera.advance(clock.now_ns())
-    clock.follow(START_NS + seconds_ns(12.9))
+    clock.follow(START_NS + to_ns(12.9))
     assert client.is_ignored()
-    clock.follow(START_NS + seconds_ns(13.0))
+    clock.follow(START_NS + to_ns(13.0))
     assert client.get("GevCCP") == 0
     assert client.get("ExposureTime") == 10_000.0
     assert client.set("Gain", 1.0) == GvcpStatus.ACCESS_DENIED
     client.connect()
     client.set("GevTimestampControlLatch", 2)
-    assert client.get("GevTimestampValue") == seconds_ns(3.0)
+    assert client.get("GevTimestampValue") == to_ns(3.0)
 
 
 def test_a_dip_of_the_supply_that_nobody_saw_costs_everything_too(
@@ -80,7 +80,7 @@ def test_a_dip_of_the_supply_that_nobody_saw_costs_everything_too(
     client.connect()
     plant.camera_power_on_ns = START_NS + 1
     assert client.is_ignored()
-    clock.follow(START_NS + 1 + seconds_ns(3.0))
+    clock.follow(START_NS + 1 + to_ns(3.0))
     assert client.get("GevCCP") == 0
 
 
@@ -90,7 +90,7 @@ def test_a_reset_is_acknowledged_and_followed_by_a_boot(
     client.connect()
     assert client.set("DeviceReset", 1) == GvcpStatus.OK
     assert client.is_ignored()
-    clock.follow(START_NS + seconds_ns(3.0))
+    clock.follow(START_NS + to_ns(3.0))
     assert client.get("GevCCP") == 0
 
 

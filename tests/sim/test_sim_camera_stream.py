@@ -25,7 +25,7 @@ from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvcp import GvcpCommand, Resend
 from thermostand.drivers.sim.gige.gvsp import PacketKind
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamSender
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 
 @pytest.mark.parametrize("packet_size", [576, 1500, 8000])
@@ -35,21 +35,21 @@ def test_a_triggered_frame_is_the_rendered_array_bit_for_bit(
     client.connect(packet_size)
     client.set("Gain", 6.0)
     client.arm()
-    clock.follow(START_NS + seconds_ns(2.0))
+    clock.follow(START_NS + to_ns(2.0))
     client.set("TriggerSoftware", 1)
     packets = client.packets()
     np.testing.assert_array_equal(image_of(packets), expected(2.0, gain_dB=6.0))
     assert [packet.packet_id for packet in packets] == list(range(len(packets)))
     assert {packet.block_id for packet in packets} == {1}
     assert {len(packet.data) + 36 for packet in packets[1:-2]} == {packet_size}
-    assert decode_leader(packets[0].data).timestamp == seconds_ns(2.0)
+    assert decode_leader(packets[0].data).timestamp == to_ns(2.0)
 
 
 def test_every_trigger_gives_one_frame_with_the_next_id(client: Client, clock: FollowedClock) -> None:
     client.connect()
     client.arm()
     for count in (1, 2, 3):
-        clock.follow(START_NS + seconds_ns(count))
+        clock.follow(START_NS + to_ns(count))
         client.set("TriggerSoftware", 1)
         packets = client.packets()
         assert packets[0].block_id == count

@@ -13,7 +13,7 @@ from thermostand.drivers.sim.motion.flap import (
     FakeFlap,
 )
 from thermostand.drivers.sim.usb import Stall
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 T0 = 1_700_000_000_000_000_000
 
@@ -27,7 +27,7 @@ class Bench:
         self.flap = FakeFlap(self.plant, self.clock, "00123")
 
     def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        self.clock.follow(self.clock.now_ns() + to_ns(duration_s))
 
     def target(self, position: int) -> None:
         assert self.flap.control_transfer(0x40, 0x84, position, 0, b"") == b""
@@ -86,7 +86,7 @@ def test_the_plant_sees_the_openness_at_any_time_not_long_past(bench: Bench) -> 
     bench.stop()
     bench.wait(1.0)
     bench.target(500)
-    openness = [bench.plant.flap_open_at(T0 + seconds_ns(time_s)) for time_s in (0.0, 0.1, 0.25, 0.9, 1.25, 1.35, 9.0)]
+    openness = [bench.plant.flap_open_at(T0 + to_ns(time_s)) for time_s in (0.0, 0.1, 0.25, 0.9, 1.25, 1.35, 9.0)]
     assert openness == pytest.approx([0.0, 0.1, 0.25, 0.25, 0.25, 0.15, 0.0])
 
 

@@ -12,7 +12,7 @@ from tests.sim.unit_bench import START_NS, UnitBench, serial_master
 from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import RtuEngine
 from thermostand.drivers.sim.units.regulator import FakeRegulator
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 RUN, STOP, WRITING_ON, RAM_MODE, BACKUP_MODE = 0x0100, 0x0101, 0x0001, 0x0401, 0x0400
 
@@ -359,7 +359,7 @@ def test_pymodbus_starts_it_up_and_heats_the_chamber(bench: Bench, client: Modbu
     assert client.read_holding_registers(0x2407, count=1, device_id=1).registers == [1 << 9 | 1 << 8 | 1 << 4]
     assert not client.write_registers(0x2103, [300], device_id=1).isError()
     assert not client.write_register(0, RUN, device_id=1).isError()
-    bench.clock.follow(START_NS + seconds_ns(1800))
+    bench.clock.follow(START_NS + to_ns(1800))
     pv, _, internal_sp, _, mv_heat, mv_cool = client.read_holding_registers(0x2000, count=6, device_id=1).registers
     assert pv == pytest.approx(300, abs=2)
     assert (internal_sp, mv_cool) == (300, 0)

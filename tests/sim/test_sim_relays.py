@@ -10,7 +10,7 @@ from tests.sim.unit_bench import START_NS, UnitBench, serial_master
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import RtuEngine
 from thermostand.drivers.sim.units.relays import FakeRelays
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 HEATER, COMPRESSOR, CAMERA = 0, 2, 5
 CHANNELS = {"heater_enable": HEATER, "compressor": COMPRESSOR, "camera_power": CAMERA}
@@ -135,9 +135,9 @@ def test_the_dead_man_holds_while_rearmed_and_drops_15_s_after_the_last_time(ben
 
 def test_the_dead_man_drops_in_the_plant_though_nobody_asks_the_board(bench: Bench) -> None:
     bench.done(ARM_15_S)
-    bench.plant.advance(START_NS + seconds_ns(15.0))
+    bench.plant.advance(START_NS + to_ns(15.0))
     assert bench.plant.heater_enabled  # the step that began before the end is over, the next has not begun
-    bench.plant.advance(START_NS + seconds_ns(15.5))
+    bench.plant.advance(START_NS + to_ns(15.5))
     assert not bench.plant.heater_enabled
 
 

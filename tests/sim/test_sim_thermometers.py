@@ -11,7 +11,7 @@ from tests.sim.unit_bench import START_NS, UnitBench, gateway_master
 from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.units.modbus import RtuEngine, crc16
 from thermostand.drivers.sim.units.thermometers import FakeThermometers
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 CHANNELS = {"granite_inside": 0, "granite_outside": 1, "artifact": 2, "air": 3, "laboratory": 5}
 UNCONNECTED = 4
@@ -118,7 +118,7 @@ def test_a_reading_does_not_depend_on_how_often_the_module_is_read() -> None:
     watched, left_alone, other_seed = Bench(), Bench(), Bench(seed=8)
     watched.air_K(0.3, 100)
     for bench in (left_alone, other_seed):
-        bench.clock.follow(START_NS + seconds_ns(30.0))
+        bench.clock.follow(START_NS + to_ns(30.0))
     assert watched.words() == watched.words() == left_alone.words()
     assert other_seed.words() != left_alone.words()
 

@@ -18,7 +18,7 @@ from tests.sim.ximc_bench import (
     T0,
     Bench,
 )
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 
 
 def test_an_alarm_stops_the_motor_until_stop_clears_it(linear: Bench) -> None:
@@ -165,5 +165,5 @@ def test_the_plant_may_ask_for_a_moment_just_past_or_still_to_come(linear: Bench
     linear.move(1_000)
     linear.wait(0.75)
     linear.ask("stop")
-    places_mm = [linear.plant.linear_mm_at(T0 + seconds_ns(time_s)) for time_s in (0.0, 0.25, 0.5, 0.75, 5.0)]
+    places_mm = [linear.plant.linear_mm_at(T0 + to_ns(time_s)) for time_s in (0.0, 0.25, 0.5, 0.75, 5.0)]
     assert places_mm == pytest.approx([5.0, 5.0 + 62.5 * 0.0025, 5.0 + 250 * 0.0025, 6.25, 6.25])

@@ -12,7 +12,7 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.modbus import BusUnit, RtuEngine, TcpEngine, Unit
 from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -37,7 +37,7 @@ class UnitBench:
         assert self.ask(request) == bytes.fromhex(request).hex(" ").upper()
 
     def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        self.clock.follow(self.clock.now_ns() + to_ns(duration_s))
 
 
 @contextmanager

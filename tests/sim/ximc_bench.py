@@ -7,7 +7,7 @@ from tests.still_plant import StillPlant
 from thermostand.drivers.framing.ximc import XimcDamage, decode, encode
 from thermostand.drivers.sim.motion.ximc import FakeAxis
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
-from thermostand.foundation.clock import FollowedClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, to_ns
 
 T0 = 1_700_000_000_000_000_000
 
@@ -62,7 +62,7 @@ class Bench:
         self.engine = self.axis.engine(lambda: self.real_s)
 
     def wait(self, duration_s: float) -> None:
-        self.clock.follow(self.clock.now_ns() + seconds_ns(duration_s))
+        self.clock.follow(self.clock.now_ns() + to_ns(duration_s))
 
     def ask(self, letters: str, payload: bytes = b"", size: int = 4) -> bytes:
         frame, rest = decode(self.engine.feed(encode(letters, payload)), {letters: max(0, size - 6)})

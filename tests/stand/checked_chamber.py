@@ -15,11 +15,11 @@ from thermostand.drivers.sim.physics.published_camera import PublishedCamera
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.guarding.channels import ChannelCheck
-from thermostand.stand.guarding.rules import natures
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.guarding.channel_check import ChannelCheck
+from thermostand.stand.guarding.rules import make_channel_models
 
-CONFIG = load_config(packaged("", "simulated"))
+CONFIG = load_config(find_packaged("", "simulated"))
 CAMERA = "camera.temperature"
 
 
@@ -45,21 +45,22 @@ class CheckedChamber(Chamber):
         **more: Any,
     ) -> None:
         super().__init__(seed, **more)
-        self.said: list[Event] = []
+        self.messages: list[Event] = []
         self.camera_degC: Callable[[float], float] = lambda true_degC: true_degC
         self._shown, self._draw = shown, draw or random.Random(0)
         self._published: PublishedCamera | None = None
         if shown.preset:
-            preset = load_document(packaged("optics", shown.preset), CameraPreset)
+            preset = load_document(find_packaged("optics", shown.preset), CameraPreset)
             self._published = PublishedCamera(preset, self.plant, STEP_s, (), self._draw.randrange(1000))
             self.plant.on_step.append(self._published.step)
-        self.check = ChannelCheck(natures(config), config.guard.sensors, self.said.append)
-        self._marks = {name: self.check.marking(name) for name in ("regulator", "thermometers", "camera")}
+        self.check = ChannelCheck(make_channel_models(config), config.guard.sensors, self.messages.append)
+        self._marks = {name: self.check.make_marker(name) for name in ("regulator", "thermometers", "camera")}
 
     @property
-    def doubted(self) -> list[tuple[str, list[str]]]:
+    def warnings(self) -> list[tuple[str, list[str]]]:
         """Rule and channels of each warning."""
-        return [(str(event.data["rule"]), list(event.data["channels"])) for event in self.said if event.level != "info"]  # type: ignore[call-overload]
+        found: list[Any] = [event.data for event in self.messages if event.level != "info"]
+        return [(str(data["rule"]), list(data["channels"])) for data in found]
 
     def _read(self, now_ns: int) -> Iterator[tuple[str, tuple[Reading, ...]]]:
         for device, readings in super()._read(now_ns):
@@ -79,7 +80,7 @@ class CheckedChamber(Chamber):
         return round(noisy_degC / self._shown.camera_step_K) * self._shown.camera_step_K
 
 
-def good_night(seed: int) -> tuple[CheckedChamber, list[tuple[float, Action]]]:
+def draw_good_run(seed: int) -> tuple[CheckedChamber, list[tuple[float, Action]]]:
     """A drawn night of one to two hours in which nothing is wrong: set-points far and near, the camera switched, the
     flap opened, the chamber stopped."""
     draw = random.Random(seed)
@@ -108,8 +109,8 @@ def good_night(seed: int) -> tuple[CheckedChamber, list[tuple[float, Action]]]:
             actions.append((draw.uniform(10, 900), lambda chamber: _power(chamber, not chamber.plant.camera_powered)))
             actions.append((draw.uniform(10, 900), lambda chamber: _power(chamber, True)))
         elif what < 0.65:
-            actions.append((draw.uniform(10, 250), lambda chamber: setattr(chamber, "flap_open", 1.0)))
-            actions.append((draw.uniform(10, 300), lambda chamber: setattr(chamber, "flap_open", 0.0)))
+            actions.append((draw.uniform(10, 250), lambda chamber: setattr(chamber, "forbid_open_flap", 1.0)))
+            actions.append((draw.uniform(10, 300), lambda chamber: setattr(chamber, "forbid_open_flap", 0.0)))
         elif what < 0.8:
             actions.append((draw.uniform(60, 900), lambda chamber: chamber.stop()))
     return chamber, actions

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from tests.recording.recorded import record
+from tests.recording.full_session import record
 from tests.stand.browser import browser
-from tests.stand.page_desk import a_night, free_port
+from tests.stand.page_service import free_port, serve_cycle
 from tests.stand.session_commands import COUNT
 
 
@@ -23,7 +23,7 @@ async def chromium():
 @pytest_asyncio.fixture(loop_scope="module")
 async def night(tmp_path: Path, chromium):
     port = free_port()
-    async with a_night(tmp_path / "sessions", port) as desk:
+    async with serve_cycle(tmp_path / "sessions", port) as desk:
         desk.port, desk.chromium = port, chromium
         yield desk
 

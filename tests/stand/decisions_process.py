@@ -13,7 +13,7 @@ LEFT_NAME = "test-left"
 ANSWERS, ASKED = "answers.json", "asked.jsonl"
 
 
-def decided(session: str, asked: Mapping[str, Any]) -> Any:
+def decide_next_visit(session: str, asked: Mapping[str, Any]) -> Any:
     with (Path(session) / ASKED).open("a") as file:
         file.write(json.dumps(asked) + "\n")
     found = json.loads((Path(session) / ANSWERS).read_text())[len((Path(session) / ASKED).read_text().splitlines()) - 1]

@@ -24,47 +24,47 @@ PORT, SECOP_PORT = map(int, os.environ.get("PORTS", "0 0").split())
 BEGUN_S = 0.2
 
 
-def connected(port: int = PORT) -> socket.socket:
+def connect(port: int = PORT) -> socket.socket:
     client = socket.create_connection(("127.0.0.1", port), 5.0)
     client.settimeout(1.0)
     return client
 
 
-def viewed(frames: bytes) -> None:
-    with connected() as client:
+def view(frames: bytes) -> None:
+    with connect() as client:
         client.sendall(VIEW)
         client.recv(65536)
         while True:
             client.sendall(frames)
 
 
-def unread(request: bytes) -> None:
+def leave_unread(request: bytes) -> None:
     """What it asks for it never reads."""
-    with connected() as client:
+    with connect() as client:
         while True:
             client.sendall(request)
 
 
-def asked(request: bytes) -> None:
-    with connected() as client:
+def ask_repeatedly(request: bytes) -> None:
+    with connect() as client:
         client.sendall(request)
         while client.recv(65536):
             pass
 
 
-def held(said: bytes, count: int = 40) -> None:
+def hold_connections(said: bytes, count: int = 40) -> None:
     """Many connections that say this and no more, the oldest of which is given up for each new one."""
-    clients = [connected() for _ in range(count)]
+    clients = [connect() for _ in range(count)]
     for client in clients:
         client.sendall(said)
     while True:
         clients.pop(0).close()
-        clients.append(connected())
+        clients.append(connect())
         with suppress(OSError):
             clients[-1].sendall(said)
 
 
-def crowded(count: int = 200) -> None:
+def crowd(count: int = 200) -> None:
     """Connections without waiting for one of them."""
     clients = [socket.socket() for _ in range(count)]
     for client in clients:
@@ -75,9 +75,9 @@ def crowded(count: int = 200) -> None:
         client.close()
 
 
-def dripped(said: bytes) -> None:
+def drip(said: bytes) -> None:
     """Many connections that say a little now and then."""
-    clients = [connected() for _ in range(40)]
+    clients = [connect() for _ in range(40)]
     for client in clients:
         client.sendall(said)
     while True:
@@ -86,28 +86,28 @@ def dripped(said: bytes) -> None:
                 client.sendall(b"X" if random.random() < 0.9 else b": y\r\nX")
             except OSError:
                 client.close()
-                clients[number] = connected()
+                clients[number] = connect()
                 clients[number].sendall(said)
         threading.Event().wait(0.001)
 
 
-def uploaded(head: bytes) -> None:
-    with connected() as client:
+def upload(head: bytes) -> None:
+    with connect() as client:
         client.sendall(head)
         for _ in range(64):
             client.sendall(bytes(MIB))
 
 
-def chunked(path: bytes) -> None:
-    with connected() as client:
+def send_chunks(path: bytes) -> None:
+    with connect() as client:
         client.sendall(b"POST " + path + b" HTTP/1.1\r\n" + HOST + b"Transfer-Encoding: chunked\r\n\r\n")
         while True:
             client.sendall(b"1\r\nx\r\n" * 10_000)
 
 
-def talked() -> None:
+def talk_secop() -> None:
     """SECoP, as fast as it goes."""
-    with connected(SECOP_PORT) as client:
+    with connect(SECOP_PORT) as client:
         client.sendall(b"*IDN?\n")
         while True:
             client.sendall(b"activate\nread chamber\nchange chamber:target 1000\n" * 500)
@@ -116,22 +116,22 @@ def talked() -> None:
 
 
 FLOODS: dict[str, tuple[int, Callable[[], None]]] = {
-    "pings": (4, lambda: viewed(PING * 1000)),
-    "texts": (4, lambda: viewed(TEXT * 1000)),
-    "viewers that read nothing": (16, lambda: unread(VIEW + PING)),
-    "answers nobody reads": (16, lambda: unread(SCHEMA * 200)),
-    "half heads": (8, lambda: held(STOP)),
-    "silent connections": (8, lambda: held(b"")),
-    "connections by the thousand": (8, crowded),
-    "slow loris": (4, lambda: dripped(STOP + b"X")),
-    "requests": (100, lambda: asked(STATE)),
-    "pipelined requests": (16, lambda: asked(STATE * 200)),
-    "bodies in chunks": (8, lambda: chunked(b"/api/v1/run/pause")),
-    "chunks for STOP": (8, lambda: chunked(b"/api/v1/run/stop")),
-    "uploads": (8, lambda: uploaded(b"POST /api/v1/queue HTTP/1.1\r\n" + HOST + b"Content-Length: 1048576\r\n\r\n")),
-    "uploads to STOP": (8, lambda: uploaded(STOP + b"Content-Length: 1000000000\r\n\r\n")),
-    "stops": (32, lambda: asked(STOP + b"\r\n")),
-    "SECoP": (8, talked),
+    "pings": (4, lambda: view(PING * 1000)),
+    "texts": (4, lambda: view(TEXT * 1000)),
+    "viewers that read nothing": (16, lambda: leave_unread(VIEW + PING)),
+    "answers nobody reads": (16, lambda: leave_unread(SCHEMA * 200)),
+    "half heads": (8, lambda: hold_connections(STOP)),
+    "silent connections": (8, lambda: hold_connections(b"")),
+    "connections by the thousand": (8, crowd),
+    "slow loris": (4, lambda: drip(STOP + b"X")),
+    "requests": (100, lambda: ask_repeatedly(STATE)),
+    "pipelined requests": (16, lambda: ask_repeatedly(STATE * 200)),
+    "bodies in chunks": (8, lambda: send_chunks(b"/api/v1/run/pause")),
+    "chunks for STOP": (8, lambda: send_chunks(b"/api/v1/run/stop")),
+    "uploads": (8, lambda: upload(b"POST /api/v1/queue HTTP/1.1\r\n" + HOST + b"Content-Length: 1048576\r\n\r\n")),
+    "uploads to STOP": (8, lambda: upload(STOP + b"Content-Length: 1000000000\r\n\r\n")),
+    "stops": (32, lambda: ask_repeatedly(STOP + b"\r\n")),
+    "SECoP": (8, talk_secop),
 }
 
 

@@ -3,7 +3,7 @@
 import asyncio
 from typing import Any
 
-from thermostand.foundation.clock import Clock, VirtualClock, seconds_ns
+from thermostand.foundation.clock import Clock, VirtualClock, to_ns
 from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
@@ -37,7 +37,7 @@ class NotedFile(LatchFile):
         super().__init__(())
         self.log = log
 
-    def keep(self, fault: Fault, since_ns: int) -> str:
+    def save(self, fault: Fault, since_ns: int) -> str:
         self.log.append(f"latch {fault.rule}")
         return ""
 
@@ -80,8 +80,8 @@ class Bench:
         """As an operator does."""
         if self.latch.fault is not None:
             self.latch.reset()
-            self.guard.begin_again()
-            self.guard.hold_again()
+            self.guard.reset_grace_times()
+            self.guard.recheck_holds()
 
     def _release(self) -> None:
         self.log.append("release")
@@ -99,7 +99,7 @@ class Bench:
         """Let the guard watch for a while; whether it still does."""
         time = asyncio.create_task(self.clock.run())
         watching = asyncio.create_task(self.guard.run())
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
         still = not watching.done()
         for task in (watching, time):
             task.cancel()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.drivers.sim.units.regulator import FakeRegulator
 from thermostand.drivers.sim.units.thermometers import FakeThermometers
-from thermostand.foundation.clock import NS_PER_S, FollowedClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, FollowedClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
@@ -54,7 +54,7 @@ class Chamber:
         self.flap_open = 0.0
         self.plant.flap_open_at = lambda time_ns: self.flap_open
         self.hottest_degC = -300.0  # of the air's bulk
-        self._compressor = CompressorState(False, START_NS - seconds_ns(3600))
+        self._compressor = CompressorState(False, START_NS - to_ns(3600))
         self.plant.on_step.append(self._watch)
         self._send("0600000001")  # writing on
         self._send("0600000401")  # RAM mode
@@ -86,7 +86,7 @@ class Chamber:
         """POLL_S later, everything due read; the instant, ns."""
         plant = self.plant
         plant.heater_enabled, plant.compressor_on = self.permitted, self._compressor.running
-        now_ns = self.clock.now_ns() + seconds_ns(POLL_S)
+        now_ns = self.clock.now_ns() + to_ns(POLL_S)
         self.clock.follow(now_ns)
         plant.advance(now_ns)
         for device, readings in self._read(now_ns):
@@ -116,7 +116,7 @@ class Chamber:
             yield readings("camera", {"temperature": shown})
         else:
             yield "camera", (bad_reading("camera.temperature", "degC", now_ns, "the camera is off"),)
-        if (now_ns - START_NS) % seconds_ns(SLOW_POLL_S) == 0:
+        if (now_ns - START_NS) % to_ns(SLOW_POLL_S) == 0:
             relays = {"heater_enable": self.permitted, "compressor": self._compressor.running}
             relays["camera_power"] = self.plant.camera_powered
             yield readings("relays", {name: float(on) for name, on in relays.items()})
@@ -142,7 +142,7 @@ class Chamber:
 Action = Callable[[Chamber], None]
 
 
-def timed(chamber: Chamber, actions: Iterable[tuple[float, Action]]) -> Iterator[int]:
+def iterate_timed(chamber: Chamber, actions: Iterable[tuple[float, Action]]) -> Iterator[int]:
     """Every poll's instant while each action is done in turn and the time after it, s, goes by."""
     due_s = chamber.time_s
     for after_s, action in actions:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from tests.stand.guarded_chamber import AIR, GRANITE, Action, Chamber, timed
+from tests.stand.guarded_chamber import AIR, GRANITE, Action, Chamber, iterate_timed
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.fault import Fault
-from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.guarding.rules import Announcements, make_watches
 
 LITTLE_K = 0.3  # how much too low a stuck probe is
 AFTER_TRIP_S = 1200.0
@@ -54,7 +54,7 @@ def _air_drifts(chamber: Chamber) -> None:
     chamber.thermometers.drift_K_per_h = {AIR: -1.0}
 
 
-def _exchanged(chamber: Chamber) -> None:
+def _exchange(chamber: Chamber) -> None:
     chamber.regulator.probe_exchanged = chamber.thermometers.air_exchanged = True
 
 
@@ -81,7 +81,7 @@ FAILURES: dict[str, Action] = {
     "PV drifts": _pv_drifts,
     "air drifts": _air_drifts,
     "both drift": _all(_pv_drifts, _air_drifts),
-    "PV and air exchanged": _exchanged,
+    "PV and air exchanged": _exchange,
     "air shorted": _air_shorted,
     "granite stuck, PV low": _all(_granite_stuck, _pv_low),
 }
@@ -120,16 +120,16 @@ def _phase(
     return [*hold, (0.0, _set(hot_degC - 14.0))], lambda air: air <= hot_degC - 7.0, after
 
 
-class Night:
+class FailureRun:
     """A chamber at the instant of a phase at which its sensors fail, the guard's whole table looking at it."""
 
     def __init__(self, phase: str, config: StandConfig, chamber_seed: int | None, hot_degC: float) -> None:
         channels = {name: each.channel for name, each in config.sensors.items()}
         self._chamber = Chamber(chamber_seed, camera_powered=bool(config.cameras), channels=channels)
-        self._table = watches(config, Announcements())
+        self._table = make_watches(config, Announcements())
         self._phase, self._hot_degC = phase, hot_degC
         before, is_there, _ = _phase(phase, hot_degC, HELD_S)
-        for now_ns in timed(self._chamber, before):
+        for now_ns in iterate_timed(self._chamber, before):
             assert (early := self._objection(now_ns)) is None, early
         while not is_there(self._chamber.plant.bulk_air_degC):
             assert (early := self._objection(self._chamber.poll())) is None, early
@@ -141,11 +141,11 @@ class Night:
         failed_s, chamber.hottest_degC = chamber.time_s, chamber.plant.bulk_air_degC
         held_s = HARMLESS_HELD_S if failure in HARMLESS else HELD_S
         *_, after = _phase(self._phase, self._hot_degC, held_s)
-        fault = self._first(timed(chamber, after))
+        fault = self._first(iterate_timed(chamber, after))
         after_s = chamber.time_s - failed_s
         if fault is not None:
             chamber.stop()
-            for _ in timed(chamber, [(AFTER_TRIP_S, _nothing)]):
+            for _ in iterate_timed(chamber, [(AFTER_TRIP_S, _nothing)]):
                 pass
         return Outcome(chamber.hottest_degC, fault, after_s)
 

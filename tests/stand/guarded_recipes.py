@@ -21,7 +21,7 @@ from thermostand.experiments.steps import (
 )
 from thermostand.foundation.documents import load_document
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 RECIPES = (
     "calibration",
@@ -49,7 +49,7 @@ class Player:
     def actions(self) -> Iterator[tuple[float, Action]]:
         """How long each lasts, s, and what it does."""
         begun_s, interruptions = 0.0, 0
-        for planned in load_document(packaged("recipes", self.recipe), Recipe).plan():
+        for planned in load_document(find_packaged("recipes", self.recipe), Recipe).plan():
             last_s = 0.0
             for last_s, action in self._perform(planned.step):
                 yield last_s, action

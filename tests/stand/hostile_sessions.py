@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format import messages
-from thermostand.recording.format.journal_lines import journal_lines, lines_of
+from thermostand.recording.format.journal_lines import format_lines, parse_lines
 from thermostand.recording.format.layout import FRAME_TABLE, FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
@@ -50,7 +50,7 @@ def frames(session: Path, number: int) -> Path:
     return session / FRAMES / f"{number:04d}.mcap"
 
 
-def changed(path: Path, change: Callable[[bytearray], object]) -> None:
+def change(path: Path, change: Callable[[bytearray], object]) -> None:
     data = bytearray(path.read_bytes())
     change(data)
     path.write_bytes(data)
@@ -64,7 +64,7 @@ def flip(path: Path, part: float) -> None:
     def one(data: bytearray) -> None:
         data[int(len(data) * part)] ^= 16
 
-    changed(path, one)
+    change(path, one)
 
 
 def hole(path: Path, part: float, size: int = 4096) -> None:
@@ -73,7 +73,7 @@ def hole(path: Path, part: float, size: int = 4096) -> None:
         end = min(len(data), begin + size)
         data[begin:end] = bytes(end - begin)
 
-    changed(path, zeros)
+    change(path, zeros)
 
 
 def sparse(path: Path, size_bytes: int) -> None:
@@ -95,26 +95,26 @@ def listening(path: Path) -> None:
 def journal(session: Path, *lines: bytes) -> None:
     """Lines with the right CRC behind those of the run."""
     data = (session / "journal.jsonl").read_bytes()
-    (session / "journal.jsonl").write_bytes(data + journal_lines(lines, lines_of(data).mark, len(data)))
+    (session / "journal.jsonl").write_bytes(data + format_lines(lines, parse_lines(data).mark, len(data)))
 
 
-def without_end(session: Path) -> None:
+def remove_end(session: Path) -> None:
     for path in (telemetry(session, 4), telemetry(session, 5), frames(session, 4)):
         path.unlink()
 
 
-def doubled(session: Path) -> None:
+def double(session: Path) -> None:
     shutil.copy(frames(session, 1), frames(session, 5))
 
 
-def swapped(session: Path) -> None:
+def swap(session: Path) -> None:
     one, other = frames(session, 1), frames(session, 2)
     one.rename(session / "kept")
     other.rename(one)
     (session / "kept").rename(other)
 
 
-def exchanged(session: Path) -> None:
+def exchange_series(session: Path) -> None:
     """Each series under the other's name."""
     (session / FRAMES).rename(session / "kept")
     (session / TELEMETRY).rename(session / FRAMES)
@@ -132,7 +132,7 @@ def false_heads(session: Path, size_bytes: int) -> None:
     (session / FRAMES / "0005.mcap.part").write_bytes(data)
 
 
-def rewritten(
+def rewrite(
     path: Path,
     attachments: dict[str, bytes] | None = None,
     behind=(),
@@ -184,10 +184,10 @@ def rewritten(
         writer.finish()
     new.replace(path)
     if relist:
-        relisted(path.parent.parent)
+        relist_segments(path.parent.parent)
 
 
-def relisted(session: Path) -> None:
+def relist_segments(session: Path) -> None:
     """With a manifest of what is there, where it has one and any of it can be read."""
     with suppress(SessionError):
         if (session / MANIFEST_NAME).exists():
@@ -197,12 +197,12 @@ def relisted(session: Path) -> None:
 def everywhere(session: Path, relist: bool = True, **changes) -> None:
     for series in (TELEMETRY, FRAMES):
         for path in sorted((session / series).glob("*.mcap")):
-            rewritten(path, relist=False, **changes)
+            rewrite(path, relist=False, **changes)
     if relist:
-        relisted(session)
+        relist_segments(session)
 
 
-def configured(text: bytes) -> Callable[[Path], None]:
+def attach_configuration(text: bytes) -> Callable[[Path], None]:
     """A session with that attached as its configuration, recipe and target."""
     return lambda session: everywhere(
         session, attachments=dict.fromkeys(("config.yaml", "recipe.yaml", "target.yaml"), text)
@@ -214,9 +214,9 @@ def event(kind: str, text: str, data_json: str) -> tuple[str, bytes]:
     return messages.EVENT, made.SerializeToString()
 
 
-def reported(*events: tuple[str, bytes]) -> Callable[[Path], None]:
+def add_events(*events: tuple[str, bytes]) -> Callable[[Path], None]:
     """A session with events behind the others of its first segment."""
-    return lambda session: rewritten(telemetry(session, 0), behind=events)
+    return lambda session: rewrite(telemetry(session, 0), behind=events)
 
 
 def step(parameters_json: str, **fields: object) -> tuple[str, bytes]:
@@ -239,7 +239,7 @@ def black(width: int, height: int) -> bytes:
     return png(width, height, b"".join(packer.compress(row) for _ in range(height)) + packer.flush())
 
 
-def imaged(change: Callable[[RawImage], object]) -> Callable[[Path], None]:
+def change_images(change: Callable[[RawImage], object]) -> Callable[[Path], None]:
     """A session whose first images are changed so."""
 
     def make(session: Path) -> None:
@@ -248,7 +248,7 @@ def imaged(change: Callable[[RawImage], object]) -> Callable[[Path], None]:
             change(read)
             return read.SerializeToString()
 
-        rewritten(frames(session, 0), instead=image)
+        rewrite(frames(session, 0), instead=image)
 
     return make
 
@@ -270,7 +270,7 @@ def aliases() -> bytes:
     return "\n".join(lines).encode()
 
 
-def renamed(name: str) -> Callable[[Path], None]:
+def rename_copy(name: str) -> Callable[[Path], None]:
     """A session beside it of that name, too: a copy whose files are links."""
 
     def make(session: Path) -> None:
@@ -279,7 +279,7 @@ def renamed(name: str) -> Callable[[Path], None]:
     return make
 
 
-def looped(session: Path) -> None:
+def loop_links(session: Path) -> None:
     shutil.rmtree(session / FRAMES)
     (session / FRAMES).symlink_to(session / FRAMES)
 
@@ -307,14 +307,14 @@ ROWS: dict[str, Row] = {
     # segments that are not there, or not where they belong
     "telemetry missing in the middle": Row(lambda s: telemetry(s, 2).unlink(), INCOMPLETE),
     "frames missing in the middle": Row(lambda s: frames(s, 2).unlink(), INCOMPLETE),
-    "the end missing": Row(without_end, INCOMPLETE),
+    "the end missing": Row(remove_end, INCOMPLETE),
     "no telemetry": Row(lambda s: shutil.rmtree(s / TELEMETRY), INCOMPLETE),
     "no frames": Row(lambda s: shutil.rmtree(s / FRAMES), INCOMPLETE),
     "nothing at all": Row(lambda s: [shutil.rmtree(s / name) for name in (TELEMETRY, FRAMES)], NONE),
-    "a segment twice": Row(doubled, DAMAGED),
-    "two segments exchanged": Row(swapped, DAMAGED),
-    "the series exchanged": Row(exchanged, DAMAGED),
-    "a segment of another session": Row(lambda s: rewritten(frames(s, 2), session_id="night-2"), DAMAGED),
+    "a segment twice": Row(double, DAMAGED),
+    "two segments exchanged": Row(swap, DAMAGED),
+    "the series exchanged": Row(exchange_series, DAMAGED),
+    "a segment of another session": Row(lambda s: rewrite(frames(s, 2), session_id="night-2"), DAMAGED),
     "a later format": Row(lambda s: everywhere(s, format="999"), UNKNOWN),
     "a format that is no number": Row(lambda s: everywhere(s, format="two"), UNKNOWN),
     "a field that is not known": Row(lambda s: everywhere(s, format_version="999"), SOUND),
@@ -329,8 +329,8 @@ ROWS: dict[str, Row] = {
     "a device for a segment": Row(lambda s: telemetry(s, 6).symlink_to("/dev/zero"), SOUND),
     "a link to itself for a segment": Row(lambda s: telemetry(s, 6).symlink_to("0006.mcap"), SOUND),
     "a folder for a segment": Row(lambda s: telemetry(s, 6).mkdir(), SOUND),
-    "a folder that is a link to itself": Row(looped, INCOMPLETE),
-    "a session by a link of an odd name": Row(renamed("=1\x1b[31m\n"), SOUND),
+    "a folder that is a link to itself": Row(loop_links, INCOMPLETE),
+    "a session by a link of an odd name": Row(rename_copy("=1\x1b[31m\n"), SOUND),
     # far too large
     "an unfinished segment of 20 GB of nothing": Row(
         lambda s: sparse(s / FRAMES / "0005.mcap.part", 20 * GB), INCOMPLETE
@@ -355,21 +355,23 @@ ROWS: dict[str, Row] = {
         lambda s: journal(s, *[b'{"entry": "Reset", "time_ns": 1}'] * 200_000), SOUND, nightly=True
     ),
     # what is attached and stated
-    "a configuration of aliases": Row(configured(aliases()), SOUND),
-    "a configuration of merge keys": Row(configured(merges(12)), SOUND),
+    "a configuration of aliases": Row(attach_configuration(aliases()), SOUND),
+    "a configuration of merge keys": Row(attach_configuration(merges(12)), SOUND),
     "a configuration of 60,000 keys": Row(
-        configured("\n".join(f"k{n}: 1" for n in range(60_000)).encode()), SOUND, nightly=True
+        attach_configuration("\n".join(f"k{n}: 1" for n in range(60_000)).encode()), SOUND, nightly=True
     ),
-    "a deep configuration": Row(configured(DEEP.encode()), SOUND),
-    "a configuration that is not UTF-8": Row(configured(b"name: \xff\xfe\n"), DAMAGED),
-    "a configuration that is code": Row(configured(b"name: !!python/object/apply:os.system ['true']\n"), SOUND),
-    "a deep event": Row(reported(event("note", "deep", DEEP)), DAMAGED),
-    "an event of huge numbers": Row(reported(event("note", "huge", '{"x": %s}' % ("9" * 5000))), DAMAGED),
+    "a deep configuration": Row(attach_configuration(DEEP.encode()), SOUND),
+    "a configuration that is not UTF-8": Row(attach_configuration(b"name: \xff\xfe\n"), DAMAGED),
+    "a configuration that is code": Row(
+        attach_configuration(b"name: !!python/object/apply:os.system ['true']\n"), SOUND
+    ),
+    "a deep event": Row(add_events(event("note", "deep", DEEP)), DAMAGED),
+    "an event of huge numbers": Row(add_events(event("note", "huge", '{"x": %s}' % ("9" * 5000))), DAMAGED),
     "an event of no numbers": Row(
-        reported(event("clock_step", "none", '{"offset_ns": NaN, "time_ns": Infinity}')), SOUND
+        add_events(event("clock_step", "none", '{"offset_ns": NaN, "time_ns": Infinity}')), SOUND
     ),
     "events of wrong types": Row(
-        reported(
+        add_events(
             *(
                 event(kind, "x", json.dumps({"status": [], "steps": {}, "blocks": "x", "offset_ns": "x"}))
                 for kind in ("run.start", "run.end", "frames_dropped", "clock_step", "gap", "interrupted")
@@ -377,16 +379,18 @@ ROWS: dict[str, Row] = {
         ),
         SOUND,
     ),
-    "an event for a spreadsheet and a terminal": Row(reported(event("note", FORMULA, "")), SOUND),
-    "a step of wrong types": Row(reported(step('{"duration_s": "x", "frames": -1}', index=2_000_000_000)), SOUND),
-    "a step that is no JSON": Row(reported(step("{")), DAMAGED),
+    "an event for a spreadsheet and a terminal": Row(add_events(event("note", FORMULA, "")), SOUND),
+    "a step of wrong types": Row(add_events(step('{"duration_s": "x", "frames": -1}', index=2_000_000_000)), SOUND),
+    "a step that is no JSON": Row(add_events(step("{")), DAMAGED),
     # images
-    "a picture of 256 megapixels": Row(imaged(lambda read: sized(read, 16_000, 16_000, b"x")), SOUND),
-    "a picture of 4 million megapixels": Row(imaged(lambda read: sized(read, 2_000_000, 2_000_000, b"x")), SOUND),
-    "a picture in colour": Row(imaged(lambda read: setattr(read, "encoding", "rgb8")), SOUND),
-    "a picture of another format": Row(imaged(lambda read: setattr(read, "encoding", "GIF89a\x1b[2J")), SOUND),
-    "a picture cut off": Row(imaged(lambda read: setattr(read, "data", read.data[:-20])), SOUND),
+    "a picture of 256 megapixels": Row(change_images(lambda read: sized(read, 16_000, 16_000, b"x")), SOUND),
+    "a picture of 4 million megapixels": Row(
+        change_images(lambda read: sized(read, 2_000_000, 2_000_000, b"x")), SOUND
+    ),
+    "a picture in colour": Row(change_images(lambda read: setattr(read, "encoding", "rgb8")), SOUND),
+    "a picture of another format": Row(change_images(lambda read: setattr(read, "encoding", "GIF89a\x1b[2J")), SOUND),
+    "a picture cut off": Row(change_images(lambda read: setattr(read, "data", read.data[:-20])), SOUND),
     "a picture of 60 megapixels": Row(
-        imaged(lambda read: sized(read, 10_000, 6_000, bytes(60_000_000))), SOUND, nightly=True
+        change_images(lambda read: sized(read, 10_000, 6_000, bytes(60_000_000))), SOUND, nightly=True
     ),
 }

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from tests.asking import ask
+from tests.daemon_queries import ask
 from thermostand.foundation.errors import SessionError
-from thermostand.stand.serving.presence import DaemonEntry, living
+from thermostand.stand.serving.instances import DaemonEntry, list_daemons
 
 
 def entries_of(session: Path) -> list[DaemonEntry]:
     """What the daemons that run `session` say of themselves; on this machine there may be others."""
-    return [each.entry for each in living() if each.entry.session == str(session)]
+    return [each.entry for each in list_daemons() if each.entry.session == str(session)]
 
 
 def obeys(session: Path) -> bool:
@@ -23,7 +23,7 @@ def obeys(session: Path) -> bool:
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import ADesk, served
 
 async def run():
     async with served(ADesk(), Path(sys.argv[1])):

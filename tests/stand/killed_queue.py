@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from thermostand.foundation.clock import Now, WallClock
-from thermostand.foundation.patience import Patience
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.writing.disk import QUEUE_LINE, DiskCalls, DiskProcess
-from thermostand.stand.service.queue_file import QueueEntry, working
-from thermostand.stand.service.queue_work import RunNotes, RunOne, drain
+from thermostand.stand.service.queue_file import QueueEntry, lock_worker
+from thermostand.stand.service.queue_worker import RunNotes, RunOne, drain
 
 
 async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str], None]) -> None:
@@ -21,8 +21,8 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
     disk = DiskProcess()
     calls = DiskCalls(disk, QUEUE_LINE, WallClock())
     try:
-        with working(directory):
-            await drain(directory, run_one, clock, tell, calls, Patience())
+        with lock_worker(directory):
+            await drain(directory, run_one, clock, tell, calls, ShutdownDeadline())
     finally:
         calls.close()
         disk.close()

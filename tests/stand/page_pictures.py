@@ -11,8 +11,8 @@ from pathlib import Path
 from PIL import Image
 
 from tests.stand.browser import PHONE, a_page, browser
-from tests.stand.page_desk import a_night, free_port
-from thermostand.stand.serving.desk import Who
+from tests.stand.page_service import free_port, serve_cycle
+from thermostand.stand.serving.api_models import Who
 
 WIDE = (1280, 900)
 COLOURS = 256
@@ -23,7 +23,7 @@ async def take(folder: Path) -> None:
     port = free_port()
     with tempfile.TemporaryDirectory() as sessions:
         async with browser() as chromium, AsyncExitStack() as pages:
-            async with a_night(Path(sessions) / "sessions", port, with_frames=True) as desk:
+            async with serve_cycle(Path(sessions) / "sessions", port, with_frames=True) as desk:
                 for name, view, size, scheme in (
                     ("page-now", "now", WIDE, "light"),
                     ("page-plan", "plan", (1280, 620), "dark"),

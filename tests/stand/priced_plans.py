@@ -9,14 +9,14 @@ from thermostand.experiments.steps import (
     Step,
     number_steps,
 )
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.items import StepMark, StepState
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S
 CAPTURE = Capture(3, 0.5, 0.1, Role.FIT, 31.0)
 
 
-def planned(*steps: Step) -> list[PlannedStep]:
+def make_priced_plan(*steps: Step) -> list[PlannedStep]:
     return list(number_steps(steps))
 
 
@@ -28,5 +28,5 @@ def marks(plan: Iterable[PlannedStep], durations_s: Iterable[float]) -> list[Ste
         for state in (StepState.STARTED, StepState.DONE):
             parameters = item.step.parameters
             found.append(StepMark(now_ns, item.step_id, item.index, item.step.kind, state, parameters))
-            now_ns += seconds_ns(duration_s) if state is StepState.STARTED else 0
+            now_ns += to_ns(duration_s) if state is StepState.STARTED else 0
     return found

@@ -14,7 +14,7 @@ def ask(*arguments: object, status: int = 0):
     return result
 
 
-def refused(*arguments: object) -> str:
+def read_refusal(*arguments: object) -> str:
     """The one line that says what is wrong with the arguments."""
     (line,) = ask(*arguments, status=2).stderr.splitlines()
     return line

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from thermostand.drivers.settings import EquilibriumSettings
 from thermostand.experiments.steps import Capture
-from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, to_ns
 from thermostand.foundation.errors import StandTripped, Unreachable
 from thermostand.foundation.events import CAMERA_EQUILIBRIUM_LOST
 from thermostand.foundation.hub import Hub
@@ -19,15 +19,15 @@ from thermostand.stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, G
 from thermostand.stand.imaging.equilibrium import CameraEquilibrium
 from thermostand.stand.interlock import Interlocked
 from thermostand.stand.running.executing.camera_gap import OffsetWatch
-from thermostand.stand.running.executing.deciding import Decider, fixed_plan
-from thermostand.stand.running.executing.executor import Executor, unguarded
+from thermostand.stand.running.executing.decisions import Decider, keep_fixed_plan
+from thermostand.stand.running.executing.executor import Executor, raise_unguarded
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
 from thermostand.stand.running.memory.entries import Gap
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
 from thermostand.stand.running.opening.holds import keep_shut_in_holds
 from thermostand.stand.running.opening.stop import Stop
-from thermostand.stand.running.resume import with_recorded
+from thermostand.stand.running.resume import merge_recorded
 from thermostand.stand.safety import Safety
 from thermostand.stand.stand import Stand
 
@@ -115,7 +115,7 @@ class SmallStand:
             return False
         if not (self.flap_open and self.heating):
             self._wrong.append("a frame of a stand that is not set up")
-        if self.supplied_ns is not None and self._clock.now_ns() < self.supplied_ns + seconds_ns(5 * TIME_CONSTANT_S):
+        if self.supplied_ns is not None and self._clock.now_ns() < self.supplied_ns + to_ns(5 * TIME_CONSTANT_S):
             self._wrong.append("a frame of a cold camera")
         self._hub.publish(Frame("camera.image", NOTHING, self._clock.now_ns(), exposure_s, 0.0, 40.0, 1, 1, 0, step_id))
         return True
@@ -142,12 +142,12 @@ class SmallStand:
 
     async def cool_down(self, band_K, time_constant_s, max_s):
         self._check()
-        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(max_s))
+        await self._clock.sleep_until(self._clock.now_ns() + to_ns(max_s))
 
     async def prompt(self, text):
         self._check()
         self.gate.hold(OPERATOR)
-        await self.gate.passed()
+        await self.gate.wait_until_open()
 
     async def check_home(self, axis):
         await self._act("check_home")
@@ -169,13 +169,23 @@ class Life:
     `reported`."""
 
     def __init__(
-        self, folder: Path, plan, start_ns, disk, chamber_degC, decides=None, *, follows=False, gap=None, meet=unguarded
+        self,
+        folder: Path,
+        plan,
+        start_ns,
+        disk,
+        chamber_degC,
+        decides=None,
+        *,
+        follows=False,
+        gap=None,
+        meet=raise_unguarded,
     ):
         self.loop = asyncio.new_event_loop()
         self.wrong = []
         self.hub, self.clock, self.reported = Hub(), VirtualClock(start_ns), []
         self.hub.subscribe(self.reported.append)
-        self._decider = Decider(folder, self.clock, decides).decide if decides else fixed_plan
+        self._decider = Decider(folder, self.clock, decides).decide if decides else keep_fixed_plan
         self.stop = Stop()
         self.stand = SmallStand(self.clock, self.hub, self.wrong)
         self.stand.gate.subscribe(self._on_gate)
@@ -203,7 +213,7 @@ class Life:
             self._journal, entries = Journal.open(folder)
             frames = [(item.time_ns, item.step_id) for item in self._disk if isinstance(item, Frame)]
             captures = {planned.step_id for planned in self._plan if isinstance(planned.step, Capture)}
-            reported = with_recorded(entries, self._disk, [frame for frame in frames if frame[1] in captures])
+            reported = merge_recorded(entries, self._disk, [frame for frame in frames if frame[1] in captures])
             last_ns = max([item.time_ns for item in self._disk] + [entry.time_ns for entry in entries], default=0)
             first = (Gap(last_ns, self.clock.now_ns()),)
         else:
@@ -211,7 +221,7 @@ class Life:
         self.log = Logbook(self.hub, self.clock, fold(self._plan, reported))
         self._time = asyncio.create_task(self.clock.run())
         await self.log.begin(self._journal, *first)
-        self.stand.gate.subscribe(self.log.held)
+        self.stand.gate.subscribe(self.log.note_hold)
         stand = cast(Stand, self.stand)  # run_stand.py holds the one against the other
         settling = SettlingWatch(stand, self.hub, self.clock, TARGET)
         self.executor = Executor(
@@ -234,22 +244,22 @@ class Life:
         """As a guarded run has it."""
         async with self.stop:
             self.stop.watch(cast(Stand, self.stand))
-            self.stop.started()
+            self.stop.begin()
             try:
                 await executor.run()
             except asyncio.CancelledError:
                 self.cancelled_before_safe = not self.stand.safe
                 raise
             finally:
-                self.stop.taking_down()
+                self.stop.begin_takedown()
                 self.stand.safety.demand()
-                await self.stand.safety.confirmed(600.0)
+                await self.stand.safety.wait_until_confirmed(600.0)
                 self.stop.ended()
-                await self.stop.settled()
+                await self.stop.wait_until_aborted()
 
     async def _flushed(self):
         published = len(self._unsaved)
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(COMMIT_S))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(COMMIT_S))
         self._disk.extend(self._unsaved[:published])
         del self._unsaved[:published]
 
@@ -267,7 +277,7 @@ class Life:
 
     def passes(self, duration_s):
         """Let time go on; whatever is to happen meanwhile happens."""
-        self.do(self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s)))
+        self.do(self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s)))
 
     def call(self, action):
         """`action()` within the daemon."""
@@ -285,18 +295,18 @@ class Life:
         while not self.run.done():
             set_up = self.log.state.set_up
             self.publish_pv(24.0 if set_up.chamber_degC is None else set_up.chamber_degC)
-            await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(0.5))
+            await self.clock.sleep_until(self.clock.now_ns() + to_ns(0.5))
 
     def interlock(self, unconfirmed=False):
         """As the guard does: hold, then make safe; the run waits. The first try may not confirm."""
         self.stand.unconfirmed = unconfirmed
         self.call(lambda: (self.stand.gate.hold(INTERLOCK), self.stand.safety.demand()))
-        self.do(self.stand.safety.tried())
+        self.do(self.stand.safety.wait_until_tried())
 
     def kill(self):
         """Nothing that happens from now on, here the end of its tasks, reaches the disk. The next life begins then."""
         now_ns, journal = self.clock.now_ns(), self._journal_path.read_bytes()
-        self._disk.extend(item for item in self._unsaved if item.time_ns <= now_ns - seconds_ns(COMMIT_EVERY_S))
+        self._disk.extend(item for item in self._unsaved if item.time_ns <= now_ns - to_ns(COMMIT_EVERY_S))
         self._disk = []
         self.call(self._cancel)
         self.passes(30.0)
@@ -309,7 +319,7 @@ class Life:
         return now_ns
 
     def _cancel(self):
-        self.stop.taking_down()
+        self.stop.begin_takedown()
         self.run.cancel()
 
     def open_s(self):
@@ -324,7 +334,7 @@ class Life:
     def _on_gate(self, reason, held):
         self.disturbances += held and reason == INTERLOCK
         if reason == INTERLOCK and not held:
-            self.stand.safety.forgive()  # or a late try would undo what the run does from now on
+            self.stand.safety.cancel_pending()  # or a late try would undo what the run does from now on
         if held and len(self.stand.gate.reasons) == 1:
             self._closed_ns = self.clock.now_ns()
             self._open_ns += self._closed_ns - self._open_since_ns

@@ -8,22 +8,22 @@ import pytest
 from pydantic import Field
 from typer.testing import CliRunner
 
-from tests.addresses import free_port
-from tests.stand.a_desk import served
+from tests.addresses import find_free_port
 from tests.stand.browser import a_page, browser, needs_chromium
-from tests.stand.secop_desk import SecopDesk, node
+from tests.stand.fake_service import serve_fake
+from tests.stand.secop_service import SecopService, node
 from tests.stand.secop_talk import talking
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Event, Item
-from thermostand.stand.commands.verbs import app_of
+from thermostand.stand.commands.verbs import make_app
 from thermostand.stand.serving.api.bridge import Bridge
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.client import server_of
-from thermostand.stand.serving.commands import command, commands_of
-from thermostand.stand.serving.desk import Conflict, Who
-from thermostand.stand.serving.page_room import PageRoom
-from thermostand.stand.serving.viewing import Viewing
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.api_models import Conflict, Who
+from thermostand.stand.serving.client import find_session_server
+from thermostand.stand.serving.commands import collect_commands, command
+from thermostand.stand.serving.page_data import PageData
+from thermostand.stand.serving.page_routes import PageRoutes
 
 
 class FlushRequest(Document):
@@ -33,7 +33,7 @@ class FlushRequest(Document):
     gently: bool = False
 
 
-class Flushing(SecopDesk):
+class Flushing(SecopService):
     """A service with one more command."""
 
     @command("/run/flush")
@@ -48,14 +48,14 @@ class Flushing(SecopDesk):
 
 
 def test_it_is_in_the_table_with_its_words():
-    found = commands_of(Flushing)["flush"]
+    found = collect_commands(Flushing)["flush"]
     assert (found.title, found.summary) == ("Flush", "Blow dry air.")
-    assert "flush" not in commands_of(SecopDesk)
+    assert "flush" not in collect_commands(SecopService)
 
 
 async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp_path: Path):
     async with node(Flushing(), tmp_path):
-        server = server_of(tmp_path / "night")
+        server = find_session_server(tmp_path / "night")
 
         async def ask(method: str, path: str, body: dict[str, object] | None = None) -> Any:
             return await asyncio.to_thread(server.request, method, path, body)
@@ -85,8 +85,8 @@ async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp
 async def test_it_is_a_verb_of_the_command_line(tmp_path: Path):
     async with node(Flushing(), tmp_path):
         typed = ["flush", "5", str(tmp_path / "night"), "--gently"]
-        done = await asyncio.to_thread(CliRunner().invoke, app_of(Flushing), typed)
-        shown = CliRunner().invoke(app_of(Flushing), ["flush", "--help"], prog_name="stand")
+        done = await asyncio.to_thread(CliRunner().invoke, make_app(Flushing), typed)
+        shown = CliRunner().invoke(make_app(Flushing), ["flush", "--help"], prog_name="stand")
     assert done.stdout == f"{tmp_path / 'night'}: flushed for 5 s, gently\n"
     assert "Example: stand flush 5" in shown.output
     assert "Seconds." in shown.output
@@ -118,14 +118,18 @@ async def test_secop_has_it_and_each_order_is_recorded_with_what_came_of_it(tmp_
 
 @needs_chromium
 async def test_the_page_has_a_button_with_its_title_and_a_field_for_each_thing_that_it_takes(tmp_path: Path):
-    desk, port = Flushing(), free_port()
-    viewing = Viewing(desk.hub, desk.clock, tmp_path, "")
+    desk, port = Flushing(), find_free_port()
+    viewing = PageData(desk.hub, desk.clock, tmp_path, "")
 
     def room(bridge: Bridge) -> Any:
-        return PageRoom(viewing)(bridge)
+        return PageRoutes(viewing)(bridge)
 
-    interface = Interface(tmp_path, port=port, rooms=(room,))
-    async with served(desk, tmp_path / "night", interface), browser() as windows, a_page(windows, port, "plan") as page:
+    interface = Interface(tmp_path, port=port, extra_routes=(room,))
+    async with (
+        serve_fake(desk, tmp_path / "night", interface),
+        browser() as windows,
+        a_page(windows, port, "plan") as page,
+    ):
         form = page.locator("form").filter(has=page.get_by_role("button", name="Flush", exact=True))
         await form.get_by_label("for, s").fill("5")
         await form.get_by_label("gently").check()

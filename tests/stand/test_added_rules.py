@@ -8,16 +8,16 @@ import pytest
 import yaml
 
 from tests.installed import install
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.events import GUARD, KINDS, Alert, alert_of
+from thermostand.foundation.events import GUARD, KINDS, Alert, make_alert
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading
 from thermostand.stand.assembly import assemble
-from thermostand.stand.commands.remedies import next_command, troubleshooting
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.commands.remedies import get_next_command, make_troubleshooting_page
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.fault import Fault
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "room-rule"
@@ -36,7 +36,7 @@ def room_hot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def config_with(**added: object) -> StandConfig:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["guard"]["added"] = added
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
@@ -66,22 +66,26 @@ async def test_it_trips_and_its_event_has_advice_alert_and_row():
     config, hub, clock = config_with(room_hot={"limit_degC": 28.0}), Hub(), VirtualClock(0)
     assembly, held, said = assemble(config, hub, clock), list[Fault](), list[Event]()
     hub.subscribe(lambda item: said.append(item) if isinstance(item, Event) else None)
-    guard = assembly.guard(held.append, held.append)
+    guard = assembly.make_guard(held.append, held.append)
     (watch,) = [each for each in guard.watches if each.rule.__module__ == "acme_room"]
     guard.watches = (watch,)
     for degC, trips in ((27.0, []), (29.0, ["room_hot"])):
-        reading = Reading("thermometers.laboratory", degC, "degC", seconds_ns(1))
-        hub.publish(Batch("thermometers", seconds_ns(1), (reading,)))
+        reading = Reading("thermometers.laboratory", degC, "degC", to_ns(1))
+        hub.publish(Batch("thermometers", to_ns(1), (reading,)))
         guard.look()
         assert [fault.rule for fault in held] == trips
     assert assembly.stand.latch.fault == held[0]
     (trip,) = [event for event in said if event.kind == f"{GUARD}room_hot"]
-    assert (trip.level, trip.text, alert_of(trip)) == (
+    assert (trip.level, trip.text, make_alert(trip)) == (
         "error",
         f"the room of {config.name} is 29.0 degC",
         Alert("hold", "guard", "lasting"),
     )
-    assert next_command(trip.kind, trip.data)
-    (row,) = [line for line in troubleshooting().splitlines() if line.startswith("| `guard.room_hot` that only warns")]
+    assert get_next_command(trip.kind, trip.data)
+    (row,) = [
+        line
+        for line in make_troubleshooting_page().splitlines()
+        if line.startswith("| `guard.room_hot` that only warns")
+    ]
     assert row.split(" | ")[1] == "warning"
     await assembly.stand.safety.close()

@@ -16,21 +16,21 @@ from thermostand.experiments.steps import (
     Soak,
     StartChamber,
     Step,
+    describe_step,
+    make_step,
+    make_step_schema,
     number_steps,
-    schema_of_steps,
-    step_of,
-    words_of,
 )
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Event, StepMark
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.estimate import price
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.estimating.estimate import price_plan
 from thermostand.stand.gate import INTERLOCK
-from thermostand.stand.running.memory.entries import Skipped, decoded, edited, encoded
-from thermostand.stand.running.memory.fold import refusal
+from thermostand.stand.running.memory.entries import Skipped, decode, encode, make_edit
+from thermostand.stand.running.memory.fold import find_refusal
 from thermostand.stand.running.memory.state import RunState
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "lamp-step"
@@ -67,29 +67,29 @@ def test_a_recipe_names_it_and_its_values_are_checked():
 
 @pytest.mark.usefixtures("lamp")
 def test_it_has_its_words_its_price_its_form_and_its_limits():
-    config = load_config(packaged("", "simulated"))
-    step = step_of("lamp_on", {"percent": 40.0})
-    assert (step.words, words_of("lamp_on", {"percent": 40.0})) == ("lamp at 40 %", "lamp at 40 %")
-    assert [each.duration_s for each in price(number_steps([step]), config)] == [4.0]
+    config = load_config(find_packaged("", "simulated"))
+    step = make_step("lamp_on", {"percent": 40.0})
+    assert (step.words, describe_step("lamp_on", {"percent": 40.0})) == ("lamp at 40 %", "lamp at 40 %")
+    assert [each.duration_s for each in price_plan(number_steps([step]), config)] == [4.0]
     with pytest.raises(ConfigError, match=r"step 1 \(lamp_on\): the lamp"):
-        price(number_steps([step_of("lamp_on", {"percent": 95.0})]), config)
-    assert cast("dict[str, Any]", schema_of_steps()["$defs"])["lamp_on"]["required"] == ["percent"]
+        price_plan(number_steps([make_step("lamp_on", {"percent": 95.0})]), config)
+    assert cast("dict[str, Any]", make_step_schema()["$defs"])["lamp_on"]["required"] == ["percent"]
     entry = Recipe.model_json_schema()["$defs"]["StepEntry"]["properties"]["lamp_on"]
     assert (entry["anyOf"][0]["minimum"], entry["anyOf"][0]["maximum"]) == (0, 100)
 
 
 @pytest.mark.usefixtures("lamp")
 def test_the_journal_keeps_it_and_a_plan_that_is_changed_has_it():
-    steps = (StartChamber(24.0), step_of("lamp_on", {"percent": 40.0}))
-    change = edited(START_NS, 0, steps)
-    assert decoded(encoded(change)) == change
+    steps = (StartChamber(24.0), make_step("lamp_on", {"percent": 40.0}))
+    change = make_edit(START_NS, 0, steps)
+    assert decode(encode(change)) == change
     state = RunState(tuple(number_steps(steps)))
-    assert "sets up" in refusal(state, Skipped(START_NS, state.plan[1].step_id))
+    assert "sets up" in find_refusal(state, Skipped(START_NS, state.plan[1].step_id))
 
 
 @pytest.mark.usefixtures("lamp")
 def test_it_is_performed_recorded_and_restored_after_a_hold(tmp_path: Path):
-    plan = tuple(number_steps([StartChamber(24.0), step_of("lamp_on", {"percent": 40.0}), Soak(60.0, band_K=0.0)]))
+    plan = tuple(number_steps([StartChamber(24.0), make_step("lamp_on", {"percent": 40.0}), Soak(60.0, band_K=0.0)]))
     (tmp_path / "life").mkdir()
     life = Life(tmp_path / "life", plan, START_NS, [], 24.0, follows=True)
     try:

@@ -3,9 +3,9 @@
 import pytest
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.events import alert_of
+from thermostand.foundation.events import make_alert
 from thermostand.foundation.items import Event
-from thermostand.stand.serving.alerts import AlertBook
+from thermostand.stand.serving.alerts import AlertTracker
 
 CAUSES = (
     "trip", "hold", "device_lost", "disk", "prompt", "run_started", "run_finished", "run_aborted", "queue_empty",
@@ -18,7 +18,7 @@ def event(kind, at_s=0.0, level="warning", text="why", **data):
 
 
 def book(**changes):
-    return AlertBook(**{"name": "lab", "causes": CAUSES, "grace_ns": 60 * NS_PER_S, "most_per_h": 20, **changes})
+    return AlertTracker(**{"name": "lab", "causes": CAUSES, "grace_ns": 60 * NS_PER_S, "most_per_h": 20, **changes})
 
 
 def reported(found, *events, until_s=0):
@@ -55,12 +55,12 @@ def reported(found, *events, until_s=0):
     ],
 )
 def test_what_an_event_means(kind, data, cause, phase):
-    sign = alert_of(event(kind, **data))
+    sign = make_alert(event(kind, **data))
     assert (cause, phase) == (None, None) if sign is None else (sign.cause, sign.phase) == (cause, phase)
 
 
 def test_a_prompt_that_nobody_is_there_for_is_not_reported():
-    assert alert_of(event("prompt", level="info", attended=False)) is None
+    assert make_alert(event("prompt", level="info", attended=False)) is None
 
 
 def test_what_is_over_within_the_grace_time_is_not_reported():

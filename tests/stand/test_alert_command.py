@@ -19,9 +19,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.alerts_section import AlertsConfig
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.serving import alerts as module
-from thermostand.stand.serving.alerts import alerting, check_alerts
+from thermostand.stand.serving.alerts import check_alerts, send_alerts
 from thermostand.stand.serving.alerts_process import run_command
 
 
@@ -50,7 +50,7 @@ async def test_a_command_gets_a_trip_as_one_argument(tmp_path: Path, script: Cal
     reported = tmp_path / "reported"
     config = AlertsConfig(command=(script(f'printf "%s|" "$@" > {reported}'), "--to", "a b"))
     hub, clock = Hub(), WallClock()
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         trip(hub, clock)
     *options, text, end = reported.read_text().split("|")
     assert (options, end) == (["--to", "a b"], "")
@@ -61,7 +61,7 @@ async def test_what_is_not_safe_is_told_and_that_it_is_safe_again(tmp_path: Path
     reported = tmp_path / "reported"
     config = AlertsConfig(command=(script(f'echo "$1" >> {reported}'),))
     hub, clock = Hub(), WallClock()
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         trip(hub, clock)
         hub.publish(NOT_CONFIRMED_SAFE.at(clock.now_ns(), "relays: no answer", unconfirmed=["relays: no answer"]))
         hub.publish(CONFIRMED_SAFE.at(clock.now_ns()))
@@ -74,7 +74,7 @@ async def test_a_command_gets_its_causes_only(tmp_path: Path, script: Callable[[
     reported = tmp_path / "reported"
     config = AlertsConfig(command=(script(f'echo "$1" >> {reported}'),), command_causes=("queue_empty",))
     hub, clock = Hub(), WallClock()
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         trip(hub, clock)
         hub.publish(RUN_START.at(clock.now_ns(), recipe="demo"))
         hub.publish(QUEUE_EMPTY.at(clock.now_ns()))
@@ -88,7 +88,7 @@ async def test_a_command_that_hangs_is_killed_and_an_event(
     monkeypatch.setattr(module, "_FAREWELL_S", 0.1)
     config = AlertsConfig(command=(script("exec sleep 600"),), command_limit_s=0.2)
     hub, clock, seen = Hub(), WallClock(), list[Item]()
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         hub.subscribe(seen.append)
         trip(hub, clock)
         await comes(lambda: len(seen) == 2)
@@ -105,7 +105,7 @@ async def test_a_command_that_hangs_delays_no_address(tmp_path: Path, script: Ca
     config = AlertsConfig(command=(command,), command_limit_s=60, secrets=receiver.secrets(tmp_path / "s.yaml"))
     hub, clock = Hub(), WallClock()
     try:
-        async with alerting("lab", config, hub, clock):
+        async with send_alerts("lab", config, hub, clock):
             trip(hub, clock)
             await comes(lambda: bool(receiver.messages))
             has_it.touch()
@@ -122,7 +122,7 @@ def test_a_command_that_cannot_be_run_is_refused(command: str):
 
 async def test_in_virtual_time_no_command_is_run(tmp_path: Path, script: Callable[[str], str]):
     reported, hub = tmp_path / "reported", Hub()
-    async with alerting("lab", AlertsConfig(command=(script(f"touch {reported}"),)), hub, VirtualClock(0)):
+    async with send_alerts("lab", AlertsConfig(command=(script(f"touch {reported}"),)), hub, VirtualClock(0)):
         trip(hub, WallClock())
     assert not reported.exists()
 
@@ -130,7 +130,7 @@ async def test_in_virtual_time_no_command_is_run(tmp_path: Path, script: Callabl
 def test_alert_test_runs_the_command(tmp_path: Path, script: Callable[[str], str]):
     import yaml
 
-    data = move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), tmp_path)
+    data = move_to_free(yaml.safe_load(find_packaged("", "simulated").read_text()), tmp_path)
     for body, status in (("true", 0), ("exit 7", 1)):
         path = tmp_path / "stand.yaml"
         path.write_text(yaml.safe_dump(data | {"alerts": {"command": [script(body)]}}))

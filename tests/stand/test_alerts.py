@@ -17,11 +17,11 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.alerts_section import AlertsConfig, load_secrets
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.running.order import load_order
 from thermostand.stand.service.run import run_real
 from thermostand.stand.serving import alerts as module
-from thermostand.stand.serving.alerts import alerting
+from thermostand.stand.serving.alerts import send_alerts
 from thermostand.stand.serving.alerts_process import deliver, ping
 
 from .alert_receiver import Receiver, until
@@ -45,7 +45,7 @@ async def reached(condition):
 async def test_an_event_becomes_a_message_and_life_is_signalled(receiver, tmp_path: Path):
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml"), alive_every_s=1)
     hub, clock = Hub(), WallClock()
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         publish(hub, clock, "guard.over_temperature", "error", "air is hot", rule="over_temperature", action="abort")
         await reached(lambda: receiver.messages)
         assert receiver.messages == [("lab: TRIPPED", "air is hot")]
@@ -60,7 +60,7 @@ async def test_an_event_becomes_a_message_and_life_is_signalled(receiver, tmp_pa
 async def test_no_sign_of_life_while_something_is_wrong_or_the_loop_stands_still(receiver, tmp_path: Path):
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml"), alive_every_s=1)
     hub, clock, well = Hub(), WallClock(), [False]
-    async with alerting("lab", config, hub, clock, lambda: well[0]):
+    async with send_alerts("lab", config, hub, clock, lambda: well[0]):
         publish(hub, clock, "guard.x", "error", action="abort")
         await reached(lambda: receiver.messages)
         well[0] = True
@@ -76,7 +76,7 @@ async def test_a_receiver_that_hangs_delays_nothing(receiver, tmp_path: Path, mo
     hub, clock = Hub(), WallClock()
     receiver.let_go.clear()
     longest_s = 0.0
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         await reached(lambda: receiver.calls)  # the sign of life hangs already
         for number in range(1000):
             before_s = time.monotonic()
@@ -95,7 +95,7 @@ async def test_what_a_receiver_refused_is_sent_again_and_reported_once_without_i
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml"))
     hub, clock, seen = Hub(), WallClock(), []
     receiver.status = 503
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         hub.subscribe(seen.append)
         publish(hub, clock, "prompt", text="close the door", attended=True)
         await reached(lambda: sum(item.kind == "alert_failed" for item in seen) == 2)
@@ -121,7 +121,7 @@ async def test_who_has_a_message_does_not_get_it_again_because_another_receiver_
     monkeypatch.setattr(module._Sender, "ask", noted)
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml", "json://127.0.0.1:9/closed"))
     hub, clock = Hub(), WallClock()
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         publish(hub, clock, "prompt", text="close the door", attended=True)
         await reached(lambda: len(tried) == 4)
     assert tried == [(), (2,), (2,), (2,)]
@@ -131,7 +131,7 @@ async def test_who_has_a_message_does_not_get_it_again_because_another_receiver_
 async def test_a_run_that_fails_before_it_begins_is_reported(receiver, tmp_path: Path):
     config = AlertsConfig(secrets=receiver.secrets(tmp_path / "secrets.yaml"))
     with pytest.raises(ConfigError):
-        async with alerting("lab", config, Hub(), WallClock()):
+        async with send_alerts("lab", config, Hub(), WallClock()):
             raise ConfigError("no device")
     ((title, text),) = receiver.messages
     assert (title.partition(":")[0], text) == ("lab", "no device")
@@ -143,7 +143,7 @@ async def test_in_virtual_time_and_without_secrets_nothing_is_sent(receiver, tmp
         (AlertsConfig(), WallClock()),
     ):
         hub = Hub()
-        async with alerting("lab", config, hub, clock):
+        async with send_alerts("lab", config, hub, clock):
             publish(hub, clock, "guard.x", "error", action="abort")
     assert receiver.messages == []
 
@@ -208,7 +208,7 @@ def test_a_folder_a_pipe_and_nothing_are_no_secrets(tmp_path: Path):
 
 
 def config_with(tmp_path: Path, secrets: Path | None) -> Path:
-    text = yaml.safe_dump(move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), tmp_path))
+    text = yaml.safe_dump(move_to_free(yaml.safe_load(find_packaged("", "simulated").read_text()), tmp_path))
     path = tmp_path / "stand.yaml"
     path.write_text(text + (f"alerts: {{secrets: {json.dumps(str(secrets))}}}\n" if secrets else ""))
     return path

@@ -12,7 +12,7 @@ from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import assemble
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 CAMERA_FILE = '''
 """A camera that always sees the same."""
@@ -43,7 +43,7 @@ class Camera:
     async def read(self):
         return (bad_reading(f"{self.name}.temperature", "degC", self._clock.now_ns(), "it has none"),)
 
-    async def temperature_place(self):
+    async def describe_temperature_place(self):
         return ""
 
     async def grab(self, exposure_s=None, due_ns=0):
@@ -86,7 +86,7 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("stands")
     (folder / "devices").mkdir()
     (folder / "devices" / "camera_still.py").write_text(CAMERA_FILE)
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     for name, side in SIDES.items():
         data["cameras"]["side"] = side
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(data))
@@ -114,11 +114,11 @@ def test_the_keys_of_a_second_camera_protocol_are_checked(said: dict[str, str]):
 
 
 def test_a_second_regulator_make_is_a_yaml(tmp_path: Path):
-    other = yaml.safe_load(packaged("registers", "omron-e5cc").read_text())
+    other = yaml.safe_load(find_packaged("registers", "omron-e5cc").read_text())
     other |= {"vendor": "Another", "model": "of nobody"}
     other["points"]["pv"]["address"] = 0x2040
     (tmp_path / "another.yaml").write_text(yaml.safe_dump(other))
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["regulator"]["registers"] = str(tmp_path / "another.yaml")
     assembly = assemble(parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml"), Hub(), VirtualClock(0))
     assert assembly.devices.regulator.name == "regulator"

@@ -9,11 +9,11 @@ import pytest
 from thermostand.drivers.sim.physics.plant import Plant, PlantSpec
 from thermostand.experiments.steps import CoolDown
 from thermostand.experiments.warm_up import WarmUp
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Quality, Reading, bad_reading
-from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, last_temperature
+from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, get_last_temperature
 
 BAND_K, TIME_CONSTANT_S = WarmUp().band_K, WarmUp().time_constant_s
 
@@ -24,8 +24,8 @@ class Room:
     def __init__(self) -> None:
         self.plant = Plant(PlantSpec(), 0)
         self.plant.camera_powered = True
-        self.plant.advance(seconds_ns(5400))
-        self.clock = VirtualClock(seconds_ns(5400), self._advance)
+        self.plant.advance(to_ns(5400))
+        self.clock = VirtualClock(to_ns(5400), self._advance)
         self.hub = Hub()
         self.events: list[Event] = []
         self.hub.subscribe(self._note)
@@ -108,13 +108,13 @@ async def test_air_that_nobody_measures_does_not_make_a_camera_cold(room: Room) 
 
 def test_only_a_good_temperature_is_a_cameras_last_one() -> None:
     good = Reading("camera.temperature", 44.0, "degC", 7)
-    assert last_temperature(good) == CameraTemperature(44.0, 7)
-    assert last_temperature(Reading("camera.temperature", 44.0, "degC", 7, Quality.STALE, "old")) is None
-    assert last_temperature(bad_reading("camera.temperature", "degC", 7, "lost")) is None
-    assert last_temperature(None) is None
+    assert get_last_temperature(good) == CameraTemperature(44.0, 7)
+    assert get_last_temperature(Reading("camera.temperature", 44.0, "degC", 7, Quality.STALE, "old")) is None
+    assert get_last_temperature(bad_reading("camera.temperature", "degC", 7, "lost")) is None
+    assert get_last_temperature(None) is None
 
 
 def test_the_excess_decays_towards_the_air_by_its_time_constant() -> None:
-    cooled = CameraTemperature(44.0, 0).after(seconds_ns(1200), 24.0, 1200.0)
+    cooled = CameraTemperature(44.0, 0).after(to_ns(1200), 24.0, 1200.0)
     assert cooled.camera_degC == pytest.approx(24.0 + 20.0 * 0.36788, abs=1e-4)
     assert CameraTemperature(44.0, 0).after(0, 24.0, 1200.0).camera_degC == 44.0

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from thermostand.foundation.clock import VirtualClock, WallClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, WallClock, to_ns
 from thermostand.foundation.errors import ConfigError, Unreachable
 from thermostand.foundation.readings import Frame
 from thermostand.stand.imaging.cameras import Cameras
@@ -66,7 +66,7 @@ async def test_in_real_time_they_expose_together():
 
     clock = WallClock()
     cameras = [Together(name, cast("Any", clock)) for name in ("camera", "side")]
-    due_ns = clock.now_ns() + seconds_ns(1.0)
+    due_ns = clock.now_ns() + to_ns(1.0)
     frames = await grab_together(cast("Any", cameras), clock, 0.1, due_ns)
     assert [frame.time_ns - due_ns for frame in frames] == [0, 0]
 

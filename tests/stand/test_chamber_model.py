@@ -6,12 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.recording.recorded import record
+from tests.recording.full_session import record
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.reading.session import Session
-from thermostand.stand.estimating.chamber_model import BAND_K, ChamberModel, Ramp, Response, fit, ramps_of
+from thermostand.stand.estimating.chamber_model import (
+    BAND_K,
+    ChamberModel,
+    Ramp,
+    Response,
+    extract_ramps,
+    fit_chamber_model,
+)
 
 HEATING = Response(dead_s=20.0, rate_K_per_s=0.04, time_constant_s=90.0)
 COOLING = Response(dead_s=70.0, rate_K_per_s=0.012, time_constant_s=150.0)
@@ -84,7 +91,7 @@ def test_the_camera_follows_for_two_time_constants():
 
 async def test_a_recorded_night_teaches_both_directions_and_the_camera(tmp_path: Path):
     session = await recorded(tmp_path / "night")
-    model = fit(ramps_of(session))
+    model = fit_chamber_model(extract_ramps(session))
     assert (model.heating_ramps, model.cooling_ramps, model.camera_ramps) == (3, 2, 5)  # 1 K is no ramp
     for gap_K in (7.0, 14.0, 40.0):
         assert model.arrival_s(10.0, 10.0 + gap_K) == pytest.approx(HEATING.arrival_s(gap_K), rel=0.03)
@@ -94,7 +101,7 @@ async def test_a_recorded_night_teaches_both_directions_and_the_camera(tmp_path:
 
 def test_ramps_that_never_ran_at_full_rate_leave_the_rate_as_it_was():
     """With a time constant of 90 s, 2 K ask for 0.022 K/s; 0.04 K/s is never seen."""
-    model = fit([ramp(24.0, 26.0), ramp(26.0, 28.0), ramp(28.0, 29.8)])
+    model = fit_chamber_model([ramp(24.0, 26.0), ramp(26.0, 28.0), ramp(28.0, 29.8)])
     default = ChamberModel()
     assert model.heating.rate_K_per_s == pytest.approx(default.heating.rate_K_per_s, rel=0.05)
     assert model.arrival_s(24.0, 26.0) == pytest.approx(HEATING.arrival_s(2.0), rel=0.05)
@@ -104,10 +111,10 @@ def test_ramps_that_never_ran_at_full_rate_leave_the_rate_as_it_was():
 def test_one_strange_ramp_among_several_changes_little():
     ramps = [ramp(begin_degC, begin_degC - 7.0, 900.0 + begin_degC) for begin_degC in (52.0, 45.0, 38.0, 31.0, 24.0)]
     late = Ramp(17.0, 10.0, tuple((level_K, 4.0 * at_s) for level_K, at_s in ramps[0].arrivals), 3000.0)
-    model = fit([*ramps, late])
+    model = fit_chamber_model([*ramps, late])
     assert model.arrival_s(24.0, 17.0) == pytest.approx(COOLING.arrival_s(7.0), rel=0.08)
     assert model.camera_time_constant_s == pytest.approx(900.0 + 41.5, abs=10.0)
 
 
 def test_nothing_recorded_is_the_default():
-    assert fit([]) == ChamberModel()
+    assert fit_chamber_model([]) == ChamberModel()

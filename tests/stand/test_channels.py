@@ -5,14 +5,14 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.nightly import by_night
-from tests.stand.checked_chamber import CAMERA, CheckedChamber, Shown, good_night
-from tests.stand.guarded_chamber import CHANNELS, Action, Chamber, timed
-from thermostand.foundation.clock import seconds_ns
+from tests.nightly import mark_nightly
+from tests.stand.checked_chamber import CAMERA, CheckedChamber, Shown, draw_good_run
+from tests.stand.guarded_chamber import CHANNELS, Action, Chamber, iterate_timed
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Quality, Reading
 from thermostand.stand.config.guard_section import SensorsConfig
-from thermostand.stand.guarding.channels import ChannelCheck, Nature
+from thermostand.stand.guarding.channel_check import ChannelCheck, ChannelModel
 
 AIR, GRANITE, PV, LABORATORY = (
     "thermometers.air",
@@ -22,13 +22,13 @@ AIR, GRANITE, PV, LABORATORY = (
 )
 
 
-@pytest.mark.parametrize("seeds", [range(4, 8), by_night(range(100, 200))], ids=["four", "a hundred"])
+@pytest.mark.parametrize("seeds", [range(4, 8), mark_nightly(range(100, 200))], ids=["four", "a hundred"])
 def test_in_good_nights_no_temperature_is_doubted(seeds: range):
     for seed in seeds:
-        chamber, actions = good_night(seed)
-        for _ in timed(chamber, actions):
+        chamber, actions = draw_good_run(seed)
+        for _ in iterate_timed(chamber, actions):
             pass
-        assert chamber.doubted == [], seed
+        assert chamber.warnings == [], seed
 
 
 def offset(kelvins: float) -> Action:
@@ -58,15 +58,15 @@ def test_a_camera_that_is_wrong_for_40_s_is_doubted_for_40_s(shown: Shown, kelvi
 
     actions = [(900.0, lambda chamber: chamber.start(40.0)), (40.0, offset(kelvins)), (1800.0, offset(0.0))]
     actions += [(40.0, offset(kelvins)), (60.0, offset(0.0))]
-    for _ in timed(chamber, actions):
+    for _ in iterate_timed(chamber, actions):
         look()
     assert qualities == [Quality.STALE if each else Quality.GOOD for each in wrong]
-    assert chamber.doubted == [("sensor_jumped", [CAMERA])] * 2
-    assert [event.kind for event in chamber.said if event.level == "info"] == ["sensor_believed"] * 2
+    assert chamber.warnings == [("sensor_jumped", [CAMERA])] * 2
+    assert [event.kind for event in chamber.messages if event.level == "info"] == ["sensor_believed"] * 2
     last = chamber.hub.latest(CAMERA)
     assert last is not None
-    assert chamber.check.doubt_of(CAMERA, last.value + kelvins, last.time_ns + seconds_ns(1)) != ""
-    assert chamber.check.doubt_of(CAMERA, last.value, last.time_ns + seconds_ns(2)) == ""
+    assert chamber.check.judge_value(CAMERA, last.value + kelvins, last.time_ns + to_ns(1)) != ""
+    assert chamber.check.judge_value(CAMERA, last.value, last.time_ns + to_ns(2)) == ""
 
 
 def module(attribute: str, value: object) -> Action:
@@ -94,12 +94,12 @@ def test_what_moves_at_one_instant_is_one_event_that_names_what_they_share(
     fault: Action, rule: str, channels: set[str], key: str
 ):
     chamber = CheckedChamber(2, Shown(), camera_powered=True)
-    for _ in timed(chamber, [(700.0, lambda chamber: chamber.start(40.0)), (1000.0, fault)]):
+    for _ in iterate_timed(chamber, [(700.0, lambda chamber: chamber.start(40.0)), (1000.0, fault)]):
         pass
-    found = next(event for event in chamber.said if event.data["rule"] == rule)
+    found = next(event for event in chamber.messages if event.data["rule"] == rule)
     assert set(found.data["channels"]) == channels  # type: ignore[call-overload]
     assert {"module", "exchanged", "together_with"} & set(found.data) == ({key} if key else set())
-    assert sum(rule == each for each, _ in chamber.doubted) == 1
+    assert sum(rule == each for each, _ in chamber.warnings) == 1
     assert all((latest := chamber.hub.latest(name)) and latest.cause == "doubt" for name in channels)
 
 
@@ -108,16 +108,16 @@ class Fed:
 
     def __init__(self, excess_K: tuple[float, float]) -> None:
         self.said: list[Event] = []
-        natures = {AIR: Nature((-40, 100)), CAMERA: Nature((-40, 120), 600.0, AIR, excess_K)}
+        natures = {AIR: ChannelModel((-40, 100)), CAMERA: ChannelModel((-40, 120), 600.0, AIR, excess_K)}
         check = ChannelCheck(natures, SensorsConfig(), self.said.append)
-        self._marks = {name: check.marking(name) for name in natures}  # each a device of its own
+        self._marks = {name: check.make_marker(name) for name in natures}  # each a device of its own
         self._now_s = 0
 
     def run(self, duration_s: int, camera: Callable[[float], float], air: Callable[[float], float]) -> Reading:
         """The last reading of the camera."""
         last: Reading | None = None
         for second in range(0, duration_s, 5):
-            now_ns = seconds_ns(self._now_s)
+            now_ns = to_ns(self._now_s)
             readings = [(AIR, air(second) + (self._now_s // 5 % 3) * 0.003), (CAMERA, camera(second))]
             for name, value in readings:
                 (last,) = self._marks[name]((Reading(name, value, "degC", now_ns),), now_ns)

@@ -17,19 +17,19 @@ from typing import Any
 import pytest
 import yaml
 
-from tests import forked
+from tests import fork_server
 from tests.addresses import move_to_free
 from tests.sections import change
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import InUse, SessionError
-from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.running.opening import claim
-from thermostand.stand.running.opening.claim import addresses, claimed
-from thermostand.stand.serving import presence
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
+from thermostand.stand.running.opening import stand_lock
+from thermostand.stand.running.opening.stand_lock import list_addresses, lock_stand
+from thermostand.stand.serving import instances
 
 
 def _simulated() -> str:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     return yaml.safe_dump(move_to_free(data, Path(f"/tmp/thermostand-{os.getpid()}")))
 
 
@@ -38,7 +38,7 @@ SIMULATED = _simulated()
 
 
 def config(base: str = "simulated", **sections: dict[str, object]) -> StandConfig:
-    data = yaml.safe_load(SIMULATED if base == "simulated" else packaged("", base).read_text())
+    data = yaml.safe_load(SIMULATED if base == "simulated" else find_packaged("", base).read_text())
     change(data, sections)
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
@@ -66,7 +66,7 @@ def without_rotary(found: StandConfig) -> StandConfig:
 async def is_free(stand: StandConfig) -> bool:
     """Whether another run could have it now."""
     try:
-        async with claimed(without_rotary(stand), Path("other")):
+        async with lock_stand(without_rotary(stand), Path("other")):
             return True
     except InUse:
         return False
@@ -86,7 +86,7 @@ async def is_free(stand: StandConfig) -> bool:
     ],
 )
 async def test_a_gateway_is_one_however_it_is_written(tmp_path: Path, one: str, other: str, is_one_device: bool):
-    async with claimed(without_rotary(bus(one)), tmp_path):
+    async with lock_stand(without_rotary(bus(one)), tmp_path):
         assert await is_free(bus(other)) is not is_one_device
 
 
@@ -94,7 +94,7 @@ async def test_a_serial_port_is_one_by_its_id_and_by_its_number(tmp_path: Path):
     port, by_id = tmp_path / "ttyUSB0", tmp_path / "usb-FTDI-port0"
     port.touch()
     by_id.symlink_to(port)
-    async with claimed(without_rotary(bus(f"serial:{by_id}")), tmp_path):
+    async with lock_stand(without_rotary(bus(f"serial:{by_id}")), tmp_path):
         assert not await is_free(bus(f"serial:{port}"))
         assert not await is_free(bus(f"serial:{tmp_path}/../{tmp_path.name}/ttyUSB0"))
         assert await is_free(bus(f"serial:{tmp_path / 'ttyUSB1'}"))
@@ -109,9 +109,9 @@ async def test_any_device_in_use_keeps_the_whole_stand_from_being_touched(tmp_pa
     mine[section] = theirs[section]
     theirs_ = config("laboratory", bus={"address": "tcp:192.0.2.1:502"}, **theirs)
     mine_ = config("laboratory", bus={"address": "tcp:192.0.2.2:502"}, **mine)
-    async with claimed(without_rotary(theirs_), tmp_path / "night"):
+    async with lock_stand(without_rotary(theirs_), tmp_path / "night"):
         with pytest.raises(InUse) as refused:
-            async with claimed(without_rotary(mine_), tmp_path / "other"):
+            async with lock_stand(without_rotary(mine_), tmp_path / "other"):
                 pass
         assert refused.value.device == name
         assert f"session {tmp_path / 'night'} (pid {os.getpid()}); nothing was touched" in str(refused.value)
@@ -120,15 +120,15 @@ async def test_any_device_in_use_keeps_the_whole_stand_from_being_touched(tmp_pa
 
 
 def test_simulated_laboratories_have_the_same_serial_numbers_and_are_not_the_same():
-    places = {address.place for address in addresses(config())}
+    places = {address.place for address in list_addresses(config())}
     assert not any("4101" in place or "00351210" in place or "TS-0001" in place for place in places)
-    real = {address.place for address in addresses(config("laboratory"))}
+    real = {address.place for address in list_addresses(config("laboratory"))}
     assert {"stage 4101", "stage 4102", "usb 00351210", "camera 12345678", "camera 192.168.10.2"} <= real
 
 
 async def test_the_locks_say_who_has_them_to_their_user_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    async with claimed(config(), tmp_path / "night"):
+    async with lock_stand(config(), tmp_path / "night"):
         files = list((tmp_path / "thermostand").iterdir())
         said = [json.loads(file.read_text()) for file in files]
     assert {stat.S_IMODE((tmp_path / "thermostand").stat().st_mode)} == {0o700}
@@ -146,11 +146,11 @@ async def test_a_run_of_another_login_is_found_though_its_files_are_not(
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "one"))
-    async with claimed(config(), tmp_path):
+    async with lock_stand(config(), tmp_path):
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "other"))
         camera = re.escape(config().cameras["camera"].address)
         with pytest.raises(InUse, match=f"camera {camera} is in use by"):
-            async with claimed(config(), tmp_path):
+            async with lock_stand(config(), tmp_path):
                 pass
 
 
@@ -158,23 +158,23 @@ async def test_in_a_folder_of_its_group_nobody_else_takes_the_locks_of_a_real_st
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     folder, stand = tmp_path / "stands", without_rotary(bus("tcp:192.0.2.1:502"))
-    place = next(address.place for address in addresses(stand) if address.device == "bus")
-    monkeypatch.setattr(presence, "STANDS_FOLDER", folder)
-    monkeypatch.setattr(claim, "STANDS_FOLDER", folder)
+    place = next(address.place for address in list_addresses(stand) if address.device == "bus")
+    monkeypatch.setattr(instances, "STANDS_FOLDER", folder)
+    monkeypatch.setattr(stand_lock, "STANDS_FOLDER", folder)
     with socket.socket(socket.AF_UNIX) as anybody:
         anybody.bind(f"\0thermostand {hashlib.sha256(place.encode()).hexdigest()}")
         assert not await is_free(stand)
         folder.mkdir()
         folder.chmod(0o2770)
-        async with claimed(stand, tmp_path / "night"):
+        async with lock_stand(stand, tmp_path / "night"):
             assert {stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()} == {0o660}
             with pytest.raises(InUse, match=f"in use by session {tmp_path / 'night'}"):
-                async with claimed(stand, tmp_path / "other"):
+                async with lock_stand(stand, tmp_path / "other"):
                     pass
     assert list(folder.iterdir()) == []
     folder.chmod(0o2777)
     with pytest.raises(SessionError, match="root has made"):
-        async with claimed(stand, tmp_path / "night"):
+        async with lock_stand(stand, tmp_path / "night"):
             pass
 
 
@@ -182,7 +182,7 @@ async def test_a_runtime_folder_that_cannot_be_used_is_said(tmp_path: Path, monk
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "thermostand").touch()
     with pytest.raises(SessionError, match="set XDG_RUNTIME_DIR"):
-        async with claimed(config(), tmp_path):
+        async with lock_stand(config(), tmp_path):
             pass
 
 
@@ -190,10 +190,10 @@ HOLDER = """
 import asyncio, sys
 from pathlib import Path
 from thermostand.stand.config.stand_config import load_config
-from thermostand.stand.running.opening.claim import claimed
+from thermostand.stand.running.opening.stand_lock import lock_stand
 
 async def run():
-    async with claimed(load_config(Path(sys.argv[1])), Path("/their/night")):
+    async with lock_stand(load_config(Path(sys.argv[1])), Path("/their/night")):
         print("has it", flush=True)
         await asyncio.Event().wait()
 
@@ -212,7 +212,7 @@ def start(tmp_path: Path) -> Iterator[Callable[[], "subprocess.Popen[str]"]]:
 
     def begin() -> "subprocess.Popen[str]":
         command = [sys.executable, "-m", "tests.code", HOLDER, file]
-        started.append(forked.popen(command, stdout=subprocess.PIPE, text=True))
+        started.append(fork_server.popen(command, stdout=subprocess.PIPE, text=True))
         return started[-1]
 
     yield begin

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 from thermostand.compensation.cli import app as compensate
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError
-from thermostand.foundation.exit_codes import BAD_INPUT, one_line_errors
-from thermostand.foundation.output import output, say, show
-from thermostand.foundation.version import installed_version
+from thermostand.foundation.exit_codes import BAD_INPUT, exit_on_error
+from thermostand.foundation.output import get_output, say, show
+from thermostand.foundation.version import read_version
 from thermostand.stand.commands.command_table import app as stand
 
 PROGRAMS = {"stand": stand, "compensate": compensate}
@@ -52,7 +52,7 @@ def test_the_list_of_commands_is_whole():
 
 
 def test_the_version_is_that_of_the_installed_distribution():
-    assert installed_version() == importlib.metadata.version("thermostand")
+    assert read_version() == importlib.metadata.version("thermostand")
 
 
 app = App()
@@ -61,11 +61,11 @@ app = App()
 @app.command()
 def go(fail: bool = False) -> None:
     """Example: go."""
-    with one_line_errors():
+    with exit_on_error():
         say("on the way")
         if fail:
             raise ConfigError("it is wrong")
-        show({"value": float("nan"), "verbose": output().verbose}, ["as people read it"])
+        show({"value": float("nan"), "verbose": get_output().verbose}, ["as people read it"])
 
 
 def test_the_result_goes_to_standard_output_and_all_else_elsewhere():

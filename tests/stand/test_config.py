@@ -4,15 +4,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.safe_ranges import largest_correction_K
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.safe_ranges import compute_largest_correction_K
+from thermostand.stand.config.stand_config import find_packaged, load_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LABORATORY = yaml.safe_load((CONFIGS / "laboratory.yaml").read_text())
@@ -34,7 +34,7 @@ def changed(tmp_path: Path, path: str, value: object, overrides: list[str] | Non
 
 @pytest.mark.parametrize("name", ["simulated", "laboratory"])
 def test_installed_configurations_are_valid(name: str):
-    assert load_config(packaged("", name)).name.startswith(name)
+    assert load_config(find_packaged("", name)).name.startswith(name)
 
 
 @pytest.mark.parametrize("path", sorted((CONFIGS / "recipes").glob("*.yaml")), ids=lambda path: path.stem)
@@ -165,13 +165,13 @@ SAFE_EDGES = [  # path, the last safe value, one that is not, what the refusal s
 def test_a_value_that_disarms_a_rule_is_refused_unless_its_path_is_accepted(
     tmp_path: Path, path: str, safe: object, unsafe: object, sentence: str
 ):
-    assert load_config(changed(tmp_path, path, safe)).accepted() == {}
+    assert load_config(changed(tmp_path, path, safe)).list_accepted() == {}
     file = changed(tmp_path, path, unsafe)
     with pytest.raises(ConfigError) as caught:
         load_config(file)
     assert str(caught.value).startswith(f"{file}: {path}: {sentence}")
     assert str(caught.value).endswith(f" {path} in guard.overrides")
-    accepted = load_config(changed(tmp_path, path, unsafe, overrides=[path])).accepted()
+    accepted = load_config(changed(tmp_path, path, unsafe, overrides=[path])).list_accepted()
     assert accepted == {path: pytest.approx(unsafe if isinstance(unsafe, int | float) else 11.0)}
 
 
@@ -234,12 +234,12 @@ def test_what_no_file_may_have_cannot_be_accepted(tmp_path: Path, path: str, val
 def test_the_largest_correction_of_a_thermometer_over_its_whole_range(
     offset_K: float, polynomial: tuple[float, ...], largest_K: float
 ):
-    assert largest_correction_K(offset_K, polynomial) == pytest.approx(largest_K)
+    assert compute_largest_correction_K(offset_K, polynomial) == pytest.approx(largest_K)
 
 
 def test_a_correction_that_is_largest_between_the_ends_is_found():
     """0 at both ends, 12.25 K in the middle, which a look at the ends would miss."""
-    assert largest_correction_K(0.0, (10.0, 0.15, -0.0025)) == pytest.approx(12.25)
+    assert compute_largest_correction_K(0.0, (10.0, 0.15, -0.0025)) == pytest.approx(12.25)
 
 
 @pytest.mark.parametrize(
@@ -278,8 +278,8 @@ def test_a_file_that_is_no_configuration_is_refused_with_its_name(tmp_path: Path
     [
         ("name: " + "[\n" * 5000 + "]" * 5000, "nested too deeply"),
         ("name: " + "[\n" * 120_000, "nested too deeply"),
-        by_night("name: " + "[" * 5000 + "]" * 5000, "nested too deeply"),  # PyYAML takes a second for one line
-        by_night("name: " + "[" * 120_000, "nested too deeply"),
+        mark_nightly("name: " + "[" * 5000 + "]" * 5000, "nested too deeply"),  # PyYAML takes a second for one line
+        mark_nightly("name: " + "[" * 120_000, "nested too deeply"),
         ("name: " + "1" * 5000, "5000 digits"),
         ("name: 0x" + "f" * 9000, "name: give text, in quotes: "),
         ("name: 2026-13-45", "month must be in 1..12"),
@@ -358,4 +358,4 @@ def test_optics_beside_the_stands_file_come_first(tmp_path: Path):
 
 def test_a_missing_file_lists_what_there_is():
     with pytest.raises(ConfigError, match=r"thermal_cycle: no such file.*calibration, demo, .*warm-up"):
-        packaged("recipes", "thermal_cycle")
+        find_packaged("recipes", "thermal_cycle")

@@ -11,23 +11,23 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from tests.asking import ask
+from tests.daemon_queries import ask
 from tests.host import Host
-from tests.stand.a_desk import STATUS, ADesk, served
+from tests.stand.fake_service import STATUS, FakeService, serve_fake
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.commands.command_table import app as stand
-from thermostand.stand.commands.control_cli import status_lines
-from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.estimating.run_estimate import Night
+from thermostand.stand.commands.control_cli import format_status_lines
+from thermostand.stand.config.stand_config import find_packaged
+from thermostand.stand.estimating.run_estimate import PlanEstimate
 from thermostand.stand.gate import Gate
 from thermostand.stand.latch import Latch
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.status import StatusBoard
-from thermostand.stand.serving.api.access import user_name
-from thermostand.stand.serving.desk import FaultState, NotConfirmed, RunStatus
+from thermostand.stand.serving.api.access import get_user_name
+from thermostand.stand.serving.api_models import FaultState, NotConfirmed, RunStatus
 
 runner = CliRunner()
 
@@ -44,7 +44,7 @@ def session(root: Path, name: str) -> Path:
 
 async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
     path = session(tmp_path, "night")
-    async with served(ADesk(run=STATUS), path):
+    async with serve_fake(FakeService(run=STATUS), path):
         lines = (await invoke("status", tmp_path)).stdout.splitlines()
         reported = json.loads((await invoke("status", path, "--json")).stdout)
     *lines, archive_line, pause_line = lines
@@ -68,7 +68,7 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
 @pytest.mark.parametrize("run", [STATUS, None])
 async def test_status_begins_with_what_is_not_confirmed_safe(tmp_path: Path, run: RunStatus | None):
     path, failure = session(tmp_path, "night"), "relays did not confirm its safe state: relays: no answer"
-    async with served(ADesk(run=run), path) as desk:
+    async with serve_fake(FakeService(run=run), path) as desk:
         desk.not_confirmed = (NotConfirmed(name="relays", since_ns=STATUS.since_ns, reason=failure, timer_s=15.0),)
         lines = (await invoke("status", path)).stdout.splitlines()
         desk.not_confirmed = ()
@@ -82,7 +82,7 @@ def test_status_tells_utc_when_the_system_clock_was_stepped_after_the_present_st
     stepped = STATUS.model_copy(
         update={"utc_offset_ns": hour_ns, "warning_ns": STATUS.since_ns, "warning_utc_offset_ns": -hour_ns}
     )
-    lines = [line for line in status_lines(Path("night"), stepped) if " UTC" in line]
+    lines = [line for line in format_status_lines(Path("night"), stepped) if " UTC" in line]
     assert lines == [
         "state         held: disk_low, operator, since 2026-01-01 17:59:00 UTC (0:01:00)",
         "ends          2026-01-01 20:00:00 UTC (in 1:00:00)",
@@ -95,7 +95,7 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     clock = host.clock()
     recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
     board = StatusBoard(
-        "night", Night(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder=recorder, clock=clock
+        "night", PlanEstimate(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder=recorder, clock=clock
     )
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))
@@ -111,7 +111,7 @@ def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
     clock, gate = Host().clock(), Gate()
     board = StatusBoard(
         "night",
-        Night(()),
+        PlanEstimate(()),
         RunState(()),
         gate,
         Stop(),
@@ -126,7 +126,7 @@ def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
 
 async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_path: Path):
     path = session(tmp_path, "night")
-    async with served(ADesk("interlock", run=STATUS), path) as desk:
+    async with serve_fake(FakeService("interlock", run=STATUS), path) as desk:
         assert "paused" in (await invoke("pause", tmp_path)).stdout
         assert desk.gate.reasons == {"operator", "interlock"}
         held = (await invoke("continue", tmp_path)).stdout
@@ -155,20 +155,20 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
         ("extend", {"step_id": "0-soak", "by_s": 1800.0}),
         ("stop", {}),
     ]
-    assert {(who.name, who.how) for who, _, _ in desk.orders} == {(user_name(os.geteuid()), "socket")}
+    assert {(who.name, who.how) for who, _, _ in desk.orders} == {(get_user_name(os.geteuid()), "socket")}
 
 
 async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):
     path = session(tmp_path, "night")
-    async with served(ADesk(run=STATUS), path):
+    async with serve_fake(FakeService(run=STATUS), path):
         assert (await invoke("status", path, "--plan")).stdout == "    1  waiting     soak\n"
 
 
 @pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "paused")])
 async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: tuple[str, ...], said: str):
-    path, desk = session(tmp_path, "night"), ADesk(run=STATUS)
+    path, desk = session(tmp_path, "night"), FakeService(run=STATUS)
     desk.moving = moving
-    async with served(desk, path):
+    async with serve_fake(desk, path):
         text = (await invoke("pause", tmp_path)).stdout
         assert said in text
         assert all(each in text for each in moving)
@@ -181,22 +181,22 @@ async def test_without_a_name_the_only_running_session_is_meant(tmp_path: Path):
     assert nobody.exit_code == 1
     sentence, _, _ = nobody.stderr.strip().partition(";")  # behind it: a stand that this computer runs elsewhere
     assert sentence.startswith(f"error: {tmp_path}: ")
-    async with served(ADesk(run=STATUS), second):
+    async with serve_fake(FakeService(run=STATUS), second):
         assert str(second) in (await invoke("status", tmp_path)).stdout
-        async with served(ADesk(run=STATUS), first):
+        async with serve_fake(FakeService(run=STATUS), first):
             both = await invoke("pause", tmp_path)
     assert both.exit_code == 2
     assert both.stderr.endswith(f": {first}, {second}\n")
 
 
 async def test_the_recording_directory_of_the_configuration_is_searched(tmp_path: Path):
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["recording"] = {"directory": str(tmp_path / "recordings")}
     config = tmp_path / "stand.yaml"
     config.write_text(yaml.safe_dump(data))
     (tmp_path / "recordings").mkdir()
     path = session(tmp_path / "recordings", "night")
-    async with served(ADesk(run=STATUS), path):
+    async with serve_fake(FakeService(run=STATUS), path):
         found = await invoke("status", "--config", config)
     assert str(path) in found.stdout
 

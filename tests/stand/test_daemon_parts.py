@@ -10,17 +10,17 @@ import pytest
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
-from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading, bad_reading
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.stand.assembly import assemble
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.service import systemd
-from thermostand.stand.service.daemon_file import Counters, KeptCounters, KeptFile, kept_in
-from thermostand.stand.service.orders import Orders
-from thermostand.stand.service.serve import Reports
-from thermostand.stand.serving.desk import Conflict, RunRequest, Who
+from thermostand.stand.service.counters import Counters, CountersFile, StoredCounters, load_counters
+from thermostand.stand.service.run_queue import RunQueue
+from thermostand.stand.service.serve import ReportQueue
+from thermostand.stand.serving.api_models import Conflict, RunRequest, Who
 
 
 def read(hub: Hub, time_s: float, **values: float) -> None:
@@ -60,17 +60,17 @@ def test_what_was_not_read_is_not_counted():
 
 
 async def test_counters_are_there_for_the_next_daemon(tmp_path: Path):
-    kept = KeptFile(tmp_path, lambda function, *arguments: function(*arguments), Hub(), WallClock())
-    last = KeptCounters(counters={"flap_cycles": 3.0})
-    kept.note(KeptCounters(counters={"flap_cycles": 1.0}))
+    kept = CountersFile(tmp_path, lambda function, *arguments: function(*arguments), Hub(), WallClock())
+    last = StoredCounters(counters={"flap_cycles": 3.0})
+    kept.note(StoredCounters(counters={"flap_cycles": 1.0}))
     kept.note(last)
-    await kept.close(Patience())
-    assert kept_in(tmp_path) == (last, "")
+    await kept.close(ShutdownDeadline())
+    assert load_counters(tmp_path) == (last, "")
     (tmp_path / "daemon.json").write_text("{")
-    found, damage = kept_in(tmp_path)  # a damaged file is no reason not to open a stand
-    assert (found, "begin again at 0" in damage) == (KeptCounters(), True)
+    found, damage = load_counters(tmp_path)  # a damaged file is no reason not to open a stand
+    assert (found, "begin again at 0" in damage) == (StoredCounters(), True)
     assert (tmp_path / "daemon.json.damaged").read_text() == "{"
-    assert kept_in(tmp_path / "nowhere") == (KeptCounters(), "")
+    assert load_counters(tmp_path / "nowhere") == (StoredCounters(), "")
 
 
 async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):
@@ -79,9 +79,9 @@ async def test_a_disk_that_refuses_is_an_event(tmp_path: Path):
 
     hub, events = Hub(), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
-    kept = KeptFile(tmp_path, refused, hub, WallClock())
-    kept.note(KeptCounters())
-    await kept.close(Patience())
+    kept = CountersFile(tmp_path, refused, hub, WallClock())
+    kept.note(StoredCounters())
+    await kept.close(ShutdownDeadline())
     assert [event.kind for event in events] == ["daemon_not_kept"]
 
 
@@ -96,9 +96,9 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
 
 
 def test_the_service_manager_is_notified_in_lines(manager: socket.socket, monkeypatch: pytest.MonkeyPatch):
-    systemd.tell(systemd.READY, "STATUS=idle")
+    systemd.notify_systemd(systemd.READY, "STATUS=idle")
     assert manager.recv(1000) == b"READY=1\nSTATUS=idle"
-    systemd.tell(systemd.extended(60.0))
+    systemd.notify_systemd(systemd.make_extension(60.0))
     assert manager.recv(1000) == b"EXTEND_TIMEOUT_USEC=60000000"
     monkeypatch.setenv("WATCHDOG_USEC", "30000000")
     assert systemd.watchdog_s() == 30.0
@@ -107,7 +107,7 @@ def test_the_service_manager_is_notified_in_lines(manager: socket.socket, monkey
 
 
 def test_what_is_done_is_told_to_the_service_manager_when_it_changes(manager: socket.socket):
-    status = systemd.Status()
+    status = systemd.StatusNotice()
     for text in ("idle", "idle", "heat by hand", "idle"):
         status.tell(text)
     assert [manager.recv(1000) for _ in range(3)] == [b"STATUS=idle", b"STATUS=heat by hand", b"STATUS=idle"]
@@ -118,14 +118,14 @@ def test_what_is_done_is_told_to_the_service_manager_when_it_changes(manager: so
 def test_without_a_service_manager_nobody_is_notified(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
-    systemd.tell(systemd.READY)
+    systemd.notify_systemd(systemd.READY)
     assert systemd.watchdog_s() is None
 
 
 async def test_a_run_whose_report_fails_is_an_event_and_the_next_has_its_turn(tmp_path: Path):
     hub, reported = Hub(), list[str]()
     hub.subscribe(lambda item: reported.append(f"{item.kind}: {item.text}") if isinstance(item, Event) else None)
-    reports = Reports(hub, WallClock())
+    reports = ReportQueue(hub, WallClock())
     reports.add(tmp_path / "first")
     reports.add(tmp_path / "second")
     async with asyncio.timeout(300):  # a report is made when nothing else wants the processor
@@ -138,14 +138,14 @@ async def test_a_run_whose_report_fails_is_an_event_and_the_next_has_its_turn(tm
 
 
 async def test_a_run_is_queued_only_when_what_it_needs_answers(tmp_path: Path):
-    config, clock, disk = load_config(packaged("", "simulated")), WallClock(), DiskProcess()
+    config, clock, disk = load_config(find_packaged("", "simulated")), WallClock(), DiskProcess()
     texts = {
-        "config.yaml": packaged("", "simulated").read_text(),
-        "target.yaml": packaged("targets", config.target).read_text(),
+        "config.yaml": find_packaged("", "simulated").read_text(),
+        "target.yaml": find_packaged("targets", config.target).read_text(),
     }
     hub = Hub()
-    open_stand = OpenStand(assemble(config, hub, clock), disk, Patience(), is_for_one=False)
-    orders, who = Orders(open_stand, disk, tmp_path, "simulated", texts), Who(name="rose", how="token")
+    open_stand = OpenStand(assemble(config, hub, clock), disk, ShutdownDeadline(), is_for_one=False)
+    orders, who = RunQueue(open_stand, disk, tmp_path, "simulated", texts), Who(name="rose", how="token")
     now_ns, request = clock.now_ns(), RunRequest(recipe="warm-up")
     hub.publish(Batch("x", now_ns, (bad_reading("thermometers.air", "degC", now_ns, "no answer", "wire"),)))
     with pytest.raises(Conflict, match=r"thermometers\.air is not read"):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.recording.runs import SECONDS, ended, entries, half_done, record_run, remove, write_journal
+from tests.recording.runs import SECONDS, ended, entries, publish_half_done, record_run, remove, write_journal
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.sessions.session_commands import app
 
@@ -63,7 +63,7 @@ def test_a_run_that_did_not_come_to_its_end_has_its_word_and_sound_files(tmp_pat
 
 
 def test_steps_are_counted_when_they_are_done_and_against_the_plan(tmp_path: Path):
-    asyncio.run(record_run(tmp_path / "s", items=half_done, status=""))
+    asyncio.run(record_run(tmp_path / "s", items=publish_half_done, status=""))
     write_journal(tmp_path / "s", *entries(SECONDS // 2, "stopped"))
     said = " ".join(ask("info", tmp_path / "s").stdout.split())
     assert "steps 10 of 20 done: 10 capture" in said

@@ -14,16 +14,16 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import RUN_END
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
-from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Reading
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.reading.notes import NOTES_NAME, add_tags
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import Assembly
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.service.day_record import DayRecord, remove_idle_logs
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.service.idle_log import IdleLog, remove_idle_logs
 
-CONFIG = packaged("", "simulated")
+CONFIG = find_packaged("", "simulated")
 
 
 class Calendar(WallClock):
@@ -42,11 +42,11 @@ class Calendar(WallClock):
 
 
 @pytest.fixture
-async def open_stand(tmp_path: Path) -> AsyncGenerator[tuple[DayRecord, Hub, Calendar]]:
+async def open_stand(tmp_path: Path) -> AsyncGenerator[tuple[IdleLog, Hub, Calendar]]:
     hub, clock = Hub(), Calendar()
     devices = SimpleNamespace(every={}, cameras={})
     assembly = cast("Assembly", SimpleNamespace(hub=hub, clock=clock, devices=devices, config=load_config(CONFIG)))
-    record = DayRecord(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, Patience())
+    record = IdleLog(assembly, {"config.yaml": CONFIG.read_text("utf-8")}, tmp_path, clock, ShutdownDeadline())
     yield record, hub, clock
     await record.end(20.0)
 
@@ -64,7 +64,7 @@ def times_ns(session: Session) -> list[int]:
 
 
 async def test_at_midnight_each_reading_is_in_one_of_two_sessions(
-    open_stand: tuple[DayRecord, Hub, Calendar], tmp_path: Path
+    open_stand: tuple[IdleLog, Hub, Calendar], tmp_path: Path
 ):
     record, hub, clock = open_stand
     clock.go_to_midnight(60.0)
@@ -95,7 +95,7 @@ async def test_at_midnight_each_reading_is_in_one_of_two_sessions(
 
 
 async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
-    open_stand: tuple[DayRecord, Hub, Calendar], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    open_stand: tuple[IdleLog, Hub, Calendar], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     record, _, clock = open_stand
     clock.go_to_midnight(-1.0)  # a second after it
@@ -105,7 +105,7 @@ async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
     def no_place(self: object, day: str) -> str:
         raise SessionError("the disk is full")
 
-    monkeypatch.setattr(DayRecord, "_place", no_place)
+    monkeypatch.setattr(IdleLog, "_find_session", no_place)
     with pytest.raises(SessionError):
         await record.begin()
     assert record.recorder is yesterday
@@ -113,7 +113,7 @@ async def test_yesterdays_record_goes_on_when_todays_cannot_be_begun(
 
 
 async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_tag(
-    open_stand: tuple[DayRecord, Hub, Calendar], tmp_path: Path
+    open_stand: tuple[IdleLog, Hub, Calendar], tmp_path: Path
 ):
     record, hub, clock = open_stand
     said: list[Event] = []

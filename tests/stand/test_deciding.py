@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from tests.journals import read_lines
-from tests.stand.decisions_process import ANSWERS, ASKED, decided
+from tests.stand.decisions_process import ANSWERS, ASKED, decide_next_visit
 from tests.stand.small_stand import Life, lives
-from thermostand.experiments.known import Enough, Undecided, Visit, after_decision, fixed_visits
+from thermostand.experiments.adaptive import Enough, Undecided, Visit, apply_decision, plan_fixed_visits
 from thermostand.experiments.parameters import Known
 from thermostand.experiments.steps import (
     Capture,
@@ -23,14 +23,14 @@ from thermostand.experiments.steps import (
     SetTemperature,
     Soak,
     Step,
+    estimate_duration_s,
     number_steps,
-    usual_s,
 )
-from thermostand.experiments.thermal_cycle import ThermalCycle, thermal_cycle
+from thermostand.experiments.thermal_cycle import ThermalCycle, plan_thermal_cycle
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Frame
-from thermostand.stand.running.executing.deciding import Decider
+from thermostand.stand.running.executing.decisions import Decider
 from thermostand.stand.running.memory.entries import Edited
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
@@ -42,7 +42,7 @@ CYCLE = ThermalCycle(
     soak_s=600.0,
     until=Known(soaks_s=(60.0, 120.0)),
 )
-PLAN = tuple(number_steps(thermal_cycle(CYCLE)))
+PLAN = tuple(number_steps(plan_thermal_cycle(CYCLE)))
 DECIDE = next(planned.step for planned in PLAN if isinstance(planned.step, Decide))
 START_NS = 1_767_290_400 * NS_PER_S
 ENOUGH = {"kind": "enough", "reason": "known to 4 mpx"}
@@ -55,7 +55,7 @@ def visit(chamber_degC: float, soak_s: float) -> dict[str, object]:
 @pytest.fixture
 def life(tmp_path: Path):
     """begin(answers): a daemon that runs PLAN, or resumes it; the last one is ended with the test."""
-    with lives(tmp_path, PLAN, START_NS, decided) as begin_life:
+    with lives(tmp_path, PLAN, START_NS, decide_next_visit) as begin_life:
 
         def begin(*answers: object, start_ns: int = START_NS) -> Life:
             if answers:
@@ -147,35 +147,35 @@ def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[
 
 async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
     (tmp_path / ANSWERS).write_text('["hang"]')
-    decider = Decider(tmp_path, WallClock(), decided)
+    decider = Decider(tmp_path, WallClock(), decide_next_visit)
     found = await decider.decide(replace(DECIDE, wait_s=0.5))
     assert isinstance(found.answer, Undecided)
     assert "within 0.5 s" in found.reason
 
 
 def total_s(steps: tuple[Step, ...]) -> float:
-    return usual_s(step for step in steps if not isinstance(step, Decide))
+    return estimate_duration_s(step for step in steps if not isinstance(step, Decide))
 
 
 @pytest.mark.parametrize("answer", [Visit(47.0, 120.0), Visit(11.0, 60.0), Undecided()])
 def test_no_course_of_decisions_takes_much_longer_than_the_fixed_cycle(answer: Any):
-    steps: tuple[Step, ...] = (DECIDE, *fixed_visits(DECIDE))
+    steps: tuple[Step, ...] = (DECIDE, *plan_fixed_visits(DECIDE))
     gone: list[Step] = []
     while steps:
         step, *rest = steps
         if isinstance(step, Decide):
-            assert tuple(rest) == fixed_visits(step)
-            steps = after_decision(step, answer)
+            assert tuple(rest) == plan_fixed_visits(step)
+            steps = apply_decision(step, answer)
         else:
             gone.append(step)
             steps = tuple(rest)
-    assert total_s(tuple(gone)) < 1.1 * total_s(fixed_visits(DECIDE))
+    assert total_s(tuple(gone)) < 1.1 * total_s(plan_fixed_visits(DECIDE))
     held_out = [step for step in gone if isinstance(step, Capture) and step.role is Role.VALIDATION]
     assert held_out
     assert all(step.chamber_degC == 40.0 for step in held_out)
 
 
 def test_enough_ends_the_cycle_with_what_was_not_validated():
-    steps = after_decision(DECIDE, Enough())
+    steps = apply_decision(DECIDE, Enough())
     assert [step for step in steps if isinstance(step, SetTemperature | Soak)] == [SetTemperature(40.0), Soak(120.0)]
     assert not math.isnan(DECIDE.left_s)

@@ -5,12 +5,12 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.stand.commands.command_table import app as order_app
 
 
 async def test_devices_by_hand_name_the_daemon_that_runs_elsewhere(tmp_path: Path):
-    async with served(ADesk(), tmp_path):
+    async with serve_fake(FakeService(), tmp_path):
         listed = await asyncio.to_thread(CliRunner().invoke, order_app, ["device", "flap", "--config", "simulated"])
     first = listed.stdout.splitlines()[0]
     assert "runs in sessions" in first

@@ -13,12 +13,12 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.estimating.estimate import price
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
+from thermostand.stand.estimating.estimate import price_plan
 
 
 def changed(change: Callable[[dict[str, Any]], object]) -> StandConfig:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     change(data)
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
@@ -28,7 +28,7 @@ def without(*sections: str) -> StandConfig:
 
 
 def plan(recipe: str, config: StandConfig) -> object:
-    return price(load_document(packaged("recipes", recipe), Recipe).plan(), config)
+    return price_plan(load_document(find_packaged("recipes", recipe), Recipe).plan(), config)
 
 
 @pytest.mark.parametrize(
@@ -51,9 +51,9 @@ def test_a_stand_without_cameras_axes_and_spare_thermometers_is_made():
         data["thermometers"] = {name: data["thermometers"][name] for name in ("air", "granite_inside")}
 
     assembly = assemble(changed(change), Hub(), VirtualClock(0))
-    polled = [poller.sensor.name for poller in assembly.pollers()]
+    polled = [poller.sensor.name for poller in assembly.make_pollers()]
     assert polled == ["relays", "regulator", "thermometers", "flap"]
-    assert assembly.guard(lambda fault: None) is not None
+    assert assembly.make_guard(lambda fault: None) is not None
 
 
 @pytest.mark.parametrize(
@@ -95,4 +95,4 @@ def test_several_cameras_are_made_polled_and_guarded(tmp_path: Path):
     second = {"address": "127.0.0.21", "serial_number": "TS-0002", "poll_s": 2.0}
     assembly = assemble(changed(lambda data: data["cameras"].update(side=second)), Hub(), VirtualClock(0))
     assert list(assembly.devices.cameras) == ["camera", "side"]
-    assert {"camera", "side"} <= {poller.sensor.name for poller in assembly.pollers()}
+    assert {"camera", "side"} <= {poller.sensor.name for poller in assembly.make_pollers()}

@@ -7,17 +7,17 @@ import pytest
 import yaml
 
 from thermostand.experiments.steps import SetTemperature, Soak, StartChamber, number_steps
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.stand.config.dew import DewConfig, dew_point_degC
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.estimate import price, way_back_s
-from thermostand.stand.estimating.learned import Learned
+from thermostand.stand.config.dew import DewConfig, compute_dew_point_degC
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.estimating.estimate import estimate_return_s, price_plan
+from thermostand.stand.estimating.learned_durations import LearnedDurations
 from thermostand.stand.fault import Fault
-from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.guarding.rules import Announcements, make_watches
 from thermostand.stand.running.order import load_order
 
 
@@ -27,17 +27,17 @@ from thermostand.stand.running.order import load_order
 )
 def test_the_dew_point_is_that_of_the_tables(air_degC: float, humidity_percent: float, expected_degC: float):
     """DIN 4108-3, table of dew points of humid air."""
-    assert dew_point_degC(air_degC, humidity_percent) == pytest.approx(expected_degC, abs=0.1)
+    assert compute_dew_point_degC(air_degC, humidity_percent) == pytest.approx(expected_degC, abs=0.1)
 
 
 def test_what_is_not_known_is_not_known():
-    assert math.isnan(dew_point_degC(math.nan, 50.0))
+    assert math.isnan(compute_dew_point_degC(math.nan, 50.0))
     assert math.isnan(DewConfig(humidity_percent=50).lowest_degC(math.nan))
     assert DewConfig(dew_point_degC=12, margin_K=2).lowest_degC(math.nan) == 14
 
 
 def stand(folder: Path, **sections: object) -> Path:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     for name, section in sections.items():
         data[name] = {**data.get(name, {}), **section} if isinstance(section, dict) else section
     (folder / "stand.yaml").write_text(yaml.safe_dump(data))
@@ -45,7 +45,7 @@ def stand(folder: Path, **sections: object) -> Path:
 
 
 def camera(**settings: object) -> dict[str, object]:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     return {"camera": {**data["cameras"]["camera"], **settings}}
 
 
@@ -81,10 +81,10 @@ def test_no_set_point_changes_faster_than_a_camera_allows(tmp_path: Path):
     slow = load_config(stand(tmp_path, cameras=camera(ambient_K_per_min=0.5), ending=back))
     assert slow.set_point_K_per_min == 0.5
     plan = list(number_steps([StartChamber(24.0), SetTemperature(34.0), Soak(60.0, band_K=0.0)]))
-    assert [step.duration_s for step in price(plan, slow)] == pytest.approx([0.0, 10.0 / 0.5 * 60.0, 60.0])
+    assert [step.duration_s for step in price_plan(plan, slow)] == pytest.approx([0.0, 10.0 / 0.5 * 60.0, 60.0])
     fast = load_config(stand(tmp_path, cameras=camera(), ending=back))
-    assert way_back_s(plan, slow, Learned()) == pytest.approx(11.0 / 0.5 * 60.0)
-    assert way_back_s(plan, fast, Learned()) < 11.0 / 0.5 * 60.0
+    assert estimate_return_s(plan, slow, LearnedDurations()) == pytest.approx(11.0 / 0.5 * 60.0)
+    assert estimate_return_s(plan, fast, LearnedDurations()) < 11.0 / 0.5 * 60.0
 
 
 class Night:
@@ -94,7 +94,7 @@ class Night:
         self.hub = Hub()
         dew = {"humidity_percent": 50, "margin_K": 1, "flap_s": 10}
         config = load_config(stand(folder, **{"dew": dew, **sections}))
-        self.watches = watches(config, Announcements())
+        self.watches = make_watches(config, Announcements())
 
     def look(self, at_s: float, flap: float, target_degC: float, camera_degC: float = 40.0) -> list[Fault]:
         values = {
@@ -103,7 +103,7 @@ class Night:
             "thermometers.laboratory": 24.0,
             "camera.temperature": camera_degC,
         }
-        time_ns = seconds_ns(at_s)
+        time_ns = to_ns(at_s)
         self.hub.publish(
             Batch("all", time_ns, tuple(Reading(name, value, "1", time_ns) for name, value in values.items()))
         )

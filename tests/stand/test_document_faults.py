@@ -5,14 +5,14 @@ from time import process_time
 
 import pytest
 
-from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import load_order, parse_order
 
-STAND = packaged("", "laboratory").read_text(encoding="utf-8")
+STAND = find_packaged("", "laboratory").read_text(encoding="utf-8")
 
 
 def refusal(old: str, new: str) -> str:
@@ -98,16 +98,16 @@ def test_what_yaml_reads_otherwise_than_it_was_meant_is_reported(text: str, sent
 
 
 @pytest.mark.parametrize(
-    "path", sorted(Path(packaged("", "simulated")).parent.rglob("*.yaml")), ids=lambda path: path.stem
+    "path", sorted(Path(find_packaged("", "simulated")).parent.rglob("*.yaml")), ids=lambda path: path.stem
 )
 def test_no_installed_file_has_a_number_to_another_base(path: Path):
     parse_any(path.read_text(encoding="utf-8"))
 
 
 def parse_any(text: str) -> None:
-    from thermostand.foundation.documents import yaml_data
+    from thermostand.foundation.documents import parse_yaml
 
-    yaml_data(text, "installed.yaml")
+    parse_yaml(text, "installed.yaml")
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_file_that_is_named_wrongly_is_reported_with_the_file_and_key_that_nam
 ):
     """When a night is planned, not when it is run."""
     file = tmp_path / "mine.yaml"
-    text = packaged("", "simulated").read_text(encoding="utf-8")
+    text = find_packaged("", "simulated").read_text(encoding="utf-8")
     assert text.count(old) == 1, old
     file.write_text(text.replace(old, key))
     with pytest.raises(ConfigError) as refused:
@@ -144,11 +144,11 @@ def test_a_file_that_is_named_wrongly_is_reported_with_the_file_and_key_that_nam
 
 
 def test_files_beside_the_one_that_names_them_are_found_from_anywhere(tmp_path: Path):
-    text = packaged("", "simulated").read_text(encoding="utf-8")
+    text = find_packaged("", "simulated").read_text(encoding="utf-8")
     (tmp_path / "maps").mkdir()
-    registers = packaged("registers", "omron-e5cc").read_text(encoding="utf-8")
+    registers = find_packaged("registers", "omron-e5cc").read_text(encoding="utf-8")
     (tmp_path / "maps" / "ours.yaml").write_text(registers.replace("E5CC", "OURS"))
-    (tmp_path / "board.yaml").write_text(packaged("targets", "paper-9x6").read_text(encoding="utf-8") + "# ours\n")
+    (tmp_path / "board.yaml").write_text(find_packaged("targets", "paper-9x6").read_text(encoding="utf-8") + "# ours\n")
     file = tmp_path / "mine.yaml"
     file.write_text(text.replace("omron-e5cc", "maps/ours.yaml").replace("target: paper-9x6", "target: board.yaml"))
     order = load_order("demo", str(file))
@@ -160,9 +160,9 @@ def test_files_beside_the_one_that_names_them_are_found_from_anywhere(tmp_path: 
 
 def test_a_session_keeps_the_optics_of_its_simulated_cameras(tmp_path: Path):
     """Those of a file, as it is when the run begins."""
-    optics = packaged("optics", "nac").read_text(encoding="utf-8") + "# ours\n"
+    optics = find_packaged("optics", "nac").read_text(encoding="utf-8") + "# ours\n"
     (tmp_path / "ours.yaml").write_text(optics)
-    text = packaged("", "simulated").read_text(encoding="utf-8")
+    text = find_packaged("", "simulated").read_text(encoding="utf-8")
     file = tmp_path / "mine.yaml"
     cameras = "simulation:\n  cameras: {camera: {optics: ours.yaml, drawn: 7}}\n"
     file.write_text(text.replace("simulation:\n", cameras))
@@ -183,5 +183,5 @@ def test_twenty_thousand_unknown_keys_are_refused_in_the_time_it_takes_to_read_t
 
 
 def test_entries_are_counted_from_1_and_a_place_may_be_the_whole():
-    assert path_text(("steps", 0, "repeat", "steps", 3)) == "steps.1.repeat.steps.4"
-    assert (path_text(("thermometers", 5, "[key]")), path_text(())) == ("thermometers.5", "")
+    assert format_path(("steps", 0, "repeat", "steps", 3)) == "steps.1.repeat.steps.4"
+    assert (format_path(("thermometers", 5, "[key]")), format_path(())) == ("thermometers.5", "")

@@ -3,11 +3,11 @@
 import random
 from collections.abc import Callable
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.stand.guarding.drifting import drifting
+from thermostand.stand.guarding.sensor_drift import limit_sensor_drift
 
 AIR, OTHER, SP, FLAP = "thermometers.air", "thermometers.ceiling", "regulator.sp", "flap.position"
 STEP_S = 30.0
@@ -23,10 +23,10 @@ def reported(
     is_bad: Callable[[float], bool] = lambda hour: False,
 ) -> dict[str, float]:
     """What the rule says first of each kind, and after how many hours; with 3 mK of noise."""
-    hub, rule, chance = Hub(), drifting((AIR, OTHER), SP, (FLAP,), limit_K=0.08), random.Random(3)
+    hub, rule, chance = Hub(), limit_sensor_drift((AIR, OTHER), SP, (FLAP,), limit_K=0.08), random.Random(3)
     found: dict[str, float] = {}
     for number in range(round(hours * HOUR_S / STEP_S)):
-        hour, now_ns = number * STEP_S / HOUR_S, seconds_ns(number * STEP_S)
+        hour, now_ns = number * STEP_S / HOUR_S, to_ns(number * STEP_S)
         true_degC = sp_degC(hour)
         air = Reading(AIR, true_degC + air_K(hour) + chance.gauss(0, 0.003), "degC", now_ns)
         readings = (

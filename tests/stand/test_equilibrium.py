@@ -9,14 +9,19 @@ from typing import Any
 import pytest
 
 from thermostand.drivers.settings import EquilibriumSettings
-from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, to_ns
 from thermostand.foundation.events import CAMERA_EQUILIBRIUM_LOST
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.imaging.camera_cooling import CameraTemperature
 from thermostand.stand.imaging.equilibrium import CameraEquilibrium
-from thermostand.stand.running.executing.camera_gap import CameraBefore, OffsetGap, OffsetWatch, doubt
+from thermostand.stand.running.executing.camera_gap import (
+    CameraHistory,
+    OffsetGap,
+    OffsetWatch,
+    explain_possible_power_loss,
+)
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
 
 TIME_CONSTANT_S, RISE_K = 900.0, 20.0
@@ -41,7 +46,7 @@ async def soaked(camera_degC, limits, limit_s=20_000.0):
 
     polling = asyncio.create_task(poll())
     equilibrium.lose("it was off")
-    await equilibrium.regained(lambda: clock.now_ns() > seconds_ns(limit_s))
+    await equilibrium.wait_until_regained(lambda: clock.now_ns() > to_ns(limit_s))
     polling.cancel()
     time.cancel()
     await asyncio.gather(time, polling, return_exceptions=True)
@@ -96,9 +101,9 @@ async def test_a_camera_that_goes_on_moving_is_reported_and_waited_for():
     ],
 )
 def test_in_doubt_a_camera_was_off(was_supplied, boot_id, camera_degC, lost, text):
-    before = CameraBefore(CameraTemperature(40.0, 0), "a", lost)
+    before = CameraHistory(CameraTemperature(40.0, 0), "a", lost)
     reading = Reading("camera.temperature", camera_degC, "degC", NS_PER_S)
-    found = doubt(before, boot_id, was_supplied, reading)
+    found = explain_possible_power_loss(before, boot_id, was_supplied, reading)
     assert found.startswith(text)
     assert bool(found) == bool(text)
 
@@ -108,12 +113,12 @@ def test_camera_minus_air_is_compared_once_at_the_nearest_set_point(after_K, kin
     hub, clock, events = Hub(), VirtualClock(1000 * NS_PER_S), []
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     watch = OffsetWatch(hub, clock, OffsetGap({24.0: 15.0, 45.0: 14.0}, 7, 9))
-    watch.settled(38.0)  # nothing is known of camera and air yet
+    watch.note_settled(38.0)  # nothing is known of camera and air yet
     for time_s in range(900, 1001, 5):
         publish(hub, "camera.temperature", time_s * NS_PER_S, 38.0 + after_K)
         publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
-    watch.settled(38.0)
-    watch.settled(38.0)
+    watch.note_settled(38.0)
+    watch.note_settled(38.0)
     (event,) = events
     assert event.kind == kind
     assert event.data == {
@@ -133,12 +138,12 @@ def test_a_camera_that_still_warms_up_is_no_offset_to_compare_with():
     for time_s in range(900, 1001, 5):
         publish(hub, "camera.temperature", time_s * NS_PER_S, 41.0 + 0.02 * (time_s - 900))
         publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
-    watch.settled(38.0)
+    watch.note_settled(38.0)
     hub.publish(Event(clock.now_ns(), "warning", CAMERA_EQUILIBRIUM_LOST, "its supply was off", {}))
     for time_s in range(1001, 1200, 5):
         publish(hub, "camera.temperature", time_s * NS_PER_S, 55.0)
         publish(hub, "thermometers.air", time_s * NS_PER_S, 38.0)
-    watch.settled(38.0)
+    watch.note_settled(38.0)
     assert [event.kind for event in events] == [CAMERA_EQUILIBRIUM_LOST]
 
 

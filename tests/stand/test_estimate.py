@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from tests.stand.priced_plans import BEGIN_NS, CAPTURE, marks, planned
+from tests.stand.priced_plans import BEGIN_NS, CAPTURE, make_priced_plan, marks
 from thermostand.drivers.devices.motion.stage_profiles import PROFILES
 from thermostand.experiments.steps import (
     CheckHome,
@@ -25,12 +25,12 @@ from thermostand.experiments.steps import (
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Event
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.estimating.chamber_model import ChamberModel, Response
-from thermostand.stand.estimating.durations import ConfiguredStand, expect, move_s
-from thermostand.stand.estimating.estimate import price, way_back_s
+from thermostand.stand.estimating.durations import ConfiguredStand, compute_move_s, price_step
+from thermostand.stand.estimating.estimate import estimate_return_s, price_plan
 from thermostand.stand.estimating.eta import Eta
-from thermostand.stand.estimating.learned import Learned
+from thermostand.stand.estimating.learned_durations import LearnedDurations
 
 RESPONSE = Response(dead_s=0.0, rate_K_per_s=0.05, time_constant_s=100.0)
 CHAMBER = ChamberModel(
@@ -40,7 +40,7 @@ CHAMBER = ChamberModel(
 
 @pytest.fixture(scope="module")
 def config() -> StandConfig:
-    return load_config(packaged("", "simulated"))
+    return load_config(find_packaged("", "simulated"))
 
 
 @pytest.mark.parametrize(
@@ -54,12 +54,12 @@ def config() -> StandConfig:
     ],
 )
 def test_a_move_is_a_trapezoid_of_speed(steps: float, duration_s: float):
-    assert move_s(PROFILES["8MT160-300"], steps) == pytest.approx(duration_s, abs=1e-3)
+    assert compute_move_s(PROFILES["8MT160-300"], steps) == pytest.approx(duration_s, abs=1e-3)
 
 
 def test_a_move_is_priced_by_the_way_from_where_the_axis_stands(config: StandConfig):
-    plan = planned(MoveTo("linear", 0.0), MoveTo("linear", 100.0), MoveTo("linear", 50.0), CheckHome("linear"))
-    homing, up, down, check = (step.duration_s for step in price(plan, config))
+    plan = make_priced_plan(MoveTo("linear", 0.0), MoveTo("linear", 100.0), MoveTo("linear", 50.0), CheckHome("linear"))
+    homing, up, down, check = (step.duration_s for step in price_plan(plan, config))
     assert homing > 10.0
     assert up == pytest.approx(100 / 2.5, abs=1.0)
     assert down == pytest.approx(50.5 / 2.5 + 0.375 + 0.548 + 0.1, abs=0.05)  # past it, then up
@@ -67,21 +67,23 @@ def test_a_move_is_priced_by_the_way_from_where_the_axis_stands(config: StandCon
 
 
 def test_a_flap_that_is_closed_already_takes_no_travel(config: StandConfig):
-    plan = planned(CloseFlap(), OpenFlap(), OpenFlap(), CloseFlap())
-    works = [step.work for step in price(plan, config)]
+    plan = make_priced_plan(CloseFlap(), OpenFlap(), OpenFlap(), CloseFlap())
+    works = [step.work for step in price_plan(plan, config)]
     assert works == ["flap at rest", "flap travel", "flap at rest", "flap travel"]
 
 
 def test_what_was_learned_replaces_what_is_usual(config: StandConfig):
-    learned = Learned(overheads_s={"flap travel": 1.1, "power_camera": 2.5, "capture": -5.0})
-    plan = planned(OpenFlap(), PowerCamera(on=True), CAPTURE, Soak(60.0))
-    durations_s = [step.duration_s for step in price(plan, config, learned)]
+    learned = LearnedDurations(overheads_s={"flap travel": 1.1, "power_camera": 2.5, "capture": -5.0})
+    plan = make_priced_plan(OpenFlap(), PowerCamera(on=True), CAPTURE, Soak(60.0))
+    durations_s = [step.duration_s for step in price_plan(plan, config, learned)]
     assert durations_s == pytest.approx([1.1, config.cameras["camera"].boot_s + 2.5, 0.0, 60.0])
 
 
 def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):
-    plan = planned(StartChamber(24.0), Soak(600.0), SetTemperature(52.0), Soak(300.0), Soak(900.0), Soak(900.0))
-    steps = price(plan, config, Learned(chamber=CHAMBER))
+    plan = make_priced_plan(
+        StartChamber(24.0), Soak(600.0), SetTemperature(52.0), Soak(300.0), Soak(900.0), Soak(900.0)
+    )
+    steps = price_plan(plan, config, LearnedDurations(chamber=CHAMBER))
     arrives_s = CHAMBER.arrival_s(24.0, 52.0)
     assert arrives_s > 600.0  # the first soak ends at its limit, twice its time
     wanted_s = [None, None, None, arrives_s, arrives_s - 600.0, None]
@@ -102,8 +104,8 @@ def test_a_soak_says_when_the_chamber_arrives(config: StandConfig):
 )
 def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: StandConfig, soak_s: float, warning: str):
     soak = Soak(soak_s / 2)
-    plan = planned(OpenFlap(), StartChamber(24.0), SetTemperature(52.0), soak, soak, CAPTURE, CAPTURE)
-    warnings = [step.warning for step in price(plan, config, Learned(chamber=CHAMBER))]
+    plan = make_priced_plan(OpenFlap(), StartChamber(24.0), SetTemperature(52.0), soak, soak, CAPTURE, CAPTURE)
+    warnings = [step.warning for step in price_plan(plan, config, LearnedDurations(chamber=CHAMBER))]
     assert (*warnings[:3], *warnings[5:]) == ("", "", "", warning, "")
 
 
@@ -120,14 +122,16 @@ def test_the_first_capture_warns_of_a_dwell_too_short_for_the_camera(config: Sta
 def test_a_soak_that_will_not_end_in_its_time_is_expected_to_go_on_and_says_so(
     config: StandConfig, soak: Soak, expected_s: float, warning: str
 ):
-    *_, step = price(planned(StartChamber(24.0), SetTemperature(52.0), soak), config, Learned(chamber=CHAMBER))
+    *_, step = price_plan(
+        make_priced_plan(StartChamber(24.0), SetTemperature(52.0), soak), config, LearnedDurations(chamber=CHAMBER)
+    )
     assert step.duration_s == pytest.approx(expected_s, abs=1.0)
     assert warning in step.warning
     assert bool(warning) == bool(step.warning)
 
 
 def test_a_capture_through_a_closed_flap_warns(config: StandConfig):
-    *_, capture = price(planned(OpenFlap(), CloseFlap(), CAPTURE), config)
+    *_, capture = price_plan(make_priced_plan(OpenFlap(), CloseFlap(), CAPTURE), config)
     assert capture.warning.startswith("the flap is closed")
 
 
@@ -141,19 +145,19 @@ def test_a_capture_through_a_closed_flap_warns(config: StandConfig):
 )
 def test_a_cool_down_too_short_for_the_camera_is_warned_of(config: StandConfig, max_s: float, warning: str):
     """20 K of excess down to 1 K takes ln 20 = 3.0 time constants."""
-    *_, step = price(planned(PowerCamera(True), CoolDown(1.0, 1480.0, max_s)), config)
+    *_, step = price_plan(make_priced_plan(PowerCamera(True), CoolDown(1.0, 1480.0, max_s)), config)
     assert step.warning == warning
 
 
 @pytest.mark.parametrize("before", [PowerCamera(True), CAPTURE])
 def test_how_warm_the_run_finds_the_camera_nobody_knows_before_a_run_has_shown_it(config: StandConfig, before: Step):
-    plan = planned(CoolDown(1.0, 1480.0, 7200.0), before, CoolDown(1.0, 1480.0, 7200.0))
-    first, _, second = price(plan, config)
+    plan = make_priced_plan(CoolDown(1.0, 1480.0, 7200.0), before, CoolDown(1.0, 1480.0, 7200.0))
+    first, _, second = price_plan(plan, config)
     assert first.duration_s == second.duration_s == pytest.approx(1480.0 * math.log(20.0))
     assert "camera that was on" in first.warning
     assert second.warning == ""
-    learned = Learned(overheads_s={first.work: -4423.6}, nights=("last",))
-    cold, _, warm = price(plan, config, learned)
+    learned = LearnedDurations(overheads_s={first.work: -4423.6}, nights=("last",))
+    cold, _, warm = price_plan(plan, config, learned)
     assert cold.duration_s == pytest.approx(10.0, abs=1.0)
     assert cold.warning == ""
     assert warm.duration_s == second.duration_s
@@ -180,23 +184,25 @@ def test_limits_that_exclude_what_homing_needs_are_found_before_the_night(
     data = config.model_dump()
     data["axes"][axis]["limits"] = limits
     with pytest.raises(ConfigError) as caught:
-        price(planned(step), StandConfig.model_validate(data))
+        price_plan(make_priced_plan(step), StandConfig.model_validate(data))
     assert sentence in str(caught.value)
-    price(planned(step), config)  # with the installed limits nothing is wrong
+    price_plan(make_priced_plan(step), config)  # with the installed limits nothing is wrong
 
 
 def test_moves_alone_need_no_place_for_a_home_check(config: StandConfig):
     data = config.model_dump()
     data["axes"]["rotary"]["limits"] = (-10, 10)
-    price(planned(MoveTo("rotary", 5)), StandConfig.model_validate(data))
+    price_plan(make_priced_plan(MoveTo("rotary", 5)), StandConfig.model_validate(data))
 
 
 def test_a_soak_until_settled_is_priced_by_the_chamber_and_the_camera(config: StandConfig):
     def soak(max_s: float) -> SoakUntilSettled:
         return SoakUntilSettled(max_s, 600.0, 600.0, 120.0, 0.2, 0.003, 0.1, 52.0)
 
-    plan = planned(StartChamber(24.0), SetTemperature(52.0), soak(9000.0), CAPTURE, SetTemperature(52.0), soak(9000.0))
-    steps = price(plan, config, Learned(chamber=CHAMBER))
+    plan = make_priced_plan(
+        StartChamber(24.0), SetTemperature(52.0), soak(9000.0), CAPTURE, SetTemperature(52.0), soak(9000.0)
+    )
+    steps = price_plan(plan, config, LearnedDurations(chamber=CHAMBER))
     arrives_s = CHAMBER.arrival_s(24.0, 52.0)
     follows_s = 900.0 * math.log(28.0 / 15.0 / 0.2)  # from 28 K in 15 min to 0.2 K/min
     assert steps[2].in_band_after_s == pytest.approx(arrives_s)
@@ -205,7 +211,7 @@ def test_a_soak_until_settled_is_priced_by_the_chamber_and_the_camera(config: St
     assert steps[2].size_bytes > steps[2].frames * 0.4 * 2448 * 2048
     assert "the dwell" not in steps[3].warning
     assert steps[5].duration_s == 600.0  # nothing has to move: the shortest
-    short = price(planned(StartChamber(24.0), SetTemperature(52.0), soak(1200.0), CAPTURE), config)
+    short = price_plan(make_priced_plan(StartChamber(24.0), SetTemperature(52.0), soak(1200.0), CAPTURE), config)
     assert short[2].duration_s == 1200.0
     assert short[3].warning.startswith("the dwell at 52 degC ends")
 
@@ -213,24 +219,24 @@ def test_a_soak_until_settled_is_priced_by_the_chamber_and_the_camera(config: St
 @pytest.mark.parametrize("step", [MoveTo("vertical", 1.0), CheckHome("vertical")])
 def test_an_axis_that_the_stand_lacks_is_refused(config: StandConfig, step: Step):
     with pytest.raises(ConfigError, match=r"step 1 .*no axis 'vertical', only linear, rotary"):
-        price(planned(step), config)
+        price_plan(make_priced_plan(step), config)
 
 
 def test_a_situation_is_what_the_steps_before_have_left(config: StandConfig):
     found = OpenFlap().situation_after(MoveTo("linear", 3.0).situation_after(Situation()))
     assert found == Situation(flap_open=True, positions={"linear": 3.0})
-    assert expect(OpenFlap(), found, ConfiguredStand(config)).work == "flap at rest"
+    assert price_step(OpenFlap(), found, ConfiguredStand(config)).work == "flap at rest"
 
 
 def test_the_way_back_to_the_laboratory_is_part_of_the_night(config: StandConfig):
-    plan = planned(StartChamber(10.0), Soak(600.0), StopChamber())
+    plan = make_priced_plan(StartChamber(10.0), Soak(600.0), StopChamber())
     back = config.model_copy(update={"ending": config.ending.model_copy(update={"to_ambient": True})})
-    after_s = way_back_s(plan, back, Learned())
-    assert way_back_s(plan, config, Learned()) == 0.0
-    assert way_back_s(planned(StartChamber(back.ending.ambient_degC)), back, Learned()) == 0.0
+    after_s = estimate_return_s(plan, back, LearnedDurations())
+    assert estimate_return_s(plan, config, LearnedDurations()) == 0.0
+    assert estimate_return_s(make_priced_plan(StartChamber(back.ending.ambient_degC)), back, LearnedDurations()) == 0.0
     assert ChamberModel().heating.arrival_s(13.0, back.ending.band_K) < after_s < back.ending.max_s
-    eta = Eta(price(plan, back), after_s=after_s)
-    assert eta.left_s(BEGIN_NS) == pytest.approx(Eta(price(plan, back)).left_s(BEGIN_NS) + after_s)
+    eta = Eta(price_plan(plan, back), after_s=after_s)
+    assert eta.left_s(BEGIN_NS) == pytest.approx(Eta(price_plan(plan, back)).left_s(BEGIN_NS) + after_s)
     for mark in marks(plan, [0.0, 600.0, 0.0]):
         eta.mark(mark)
     eta.event(Event(BEGIN_NS, "info", "to_ambient", ""))

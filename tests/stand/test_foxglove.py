@@ -10,9 +10,9 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from tests.addresses import free_port
+from tests.addresses import find_free_port
 from thermostand.foundation.readings import Quality
-from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
+from thermostand.stand.serving.api_models import HeatByHand, ReadingState, StandState
 
 live = pytest.importorskip("thermostand.stand.commands.foxglove_live")
 NOW_NS = 1_795_000_000_000_000_000
@@ -59,7 +59,7 @@ async def data(viewer: ClientConnection) -> tuple[int, int, bytes]:
 
 
 async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot_write():
-    port = free_port()
+    port = find_free_port()
     published = live.FoxgloveServer("a stand", port)
     pictures = [(NOW_NS, b"\xff\xd8 a picture")]
     asked: list[int] = []

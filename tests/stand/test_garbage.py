@@ -8,15 +8,16 @@ import asyncio, gc, sys, time
 from pathlib import Path
 from thermostand.foundation.items import Event
 from thermostand.stand.serving.api.stream import EVENTS, READINGS
-from thermostand.stand.serving.client import server_of
-from tests.stand.a_desk import ADesk, served
+from thermostand.stand.serving.client import find_session_server
+from tests.stand.fake_service import FakeService, serve_fake
 
 async def main():
-    async with served(ADesk(), Path(sys.argv[1]) / "night") as desk:
+    async with serve_fake(FakeService(), Path(sys.argv[1]) / "night") as desk:
         for number in range(EVENTS + READINGS):
             desk.tell("a text", value=number) if number % 2 else desk.hub.publish(desk.batch(20.0))
             if number % 1000 == 0:
-                await asyncio.to_thread(server_of(Path(sys.argv[1]) / "night").request, "GET", "/api/v1/events", None)
+                server = find_session_server(Path(sys.argv[1]) / "night")
+                await asyncio.to_thread(server.request, "GET", "/api/v1/events", None)
         searched_s = []
         for _ in range(5):
             begun_s = time.thread_time()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.stand.gate import Gate, Phase, PhaseTurn, next_phase
+from thermostand.stand.gate import Gate, Phase, PhaseTurn, get_next_phase
 
 REASONS = st.sampled_from(["operator", "interlock", "camera_lost", "disk_low"])
 
@@ -28,10 +28,10 @@ def test_the_gate_is_open_exactly_when_no_reason_is_left_and_no_reason_clears_an
 
 async def test_a_waiting_step_passes_when_the_last_reason_goes():
     gate = Gate()
-    await gate.passed()
+    await gate.wait_until_open()
     gate.hold("operator")
     gate.hold("disk_low")
-    waiting = asyncio.create_task(gate.passed())
+    waiting = asyncio.create_task(gate.wait_until_open())
     gate.clear("operator")
     await asyncio.sleep(0)
     assert not waiting.done()
@@ -42,7 +42,7 @@ async def test_a_waiting_step_passes_when_the_last_reason_goes():
 async def test_a_gate_that_closes_again_before_the_waiter_runs_keeps_it_waiting():
     gate = Gate()
     gate.hold("operator")
-    waiting = asyncio.create_task(gate.passed())
+    waiting = asyncio.create_task(gate.wait_until_open())
     await asyncio.sleep(0)
     gate.clear("operator")
     gate.hold("disk_low")
@@ -54,7 +54,7 @@ async def test_a_gate_that_closes_again_before_the_waiter_runs_keeps_it_waiting(
 
 async def test_a_hold_for_a_moment_is_not_missed():
     gate = Gate()
-    waiting = asyncio.create_task(gate.closed())
+    waiting = asyncio.create_task(gate.wait_until_closed())
     await asyncio.sleep(0)
     gate.hold("operator")
     gate.clear("operator")
@@ -63,25 +63,25 @@ async def test_a_hold_for_a_moment_is_not_missed():
 
 @pytest.mark.parametrize("phase", Phase)
 def test_stop_ends_a_run_from_every_phase_and_nothing_brings_it_back(phase: Phase):
-    stopped = next_phase(phase, PhaseTurn.STOP)
+    stopped = get_next_phase(phase, PhaseTurn.STOP)
     assert stopped in (Phase.ABORTING, Phase.ENDING, Phase.ENDED)
     for turns in itertools.product((PhaseTurn.START, PhaseTurn.HOLD, PhaseTurn.RELEASE, PhaseTurn.STOP), repeat=2):
         after = stopped
         for turn in turns:
-            after = next_phase(after, turn)
+            after = get_next_phase(after, turn)
         assert after is stopped
-    assert next_phase(stopped, PhaseTurn.END) is Phase.ENDED
+    assert get_next_phase(stopped, PhaseTurn.END) is Phase.ENDED
 
 
 @pytest.mark.parametrize("phase", Phase)
 def test_a_run_that_takes_itself_down_is_not_aborted_any_more(phase: Phase):
-    ending = next_phase(phase, PhaseTurn.TAKE_DOWN)
+    ending = get_next_phase(phase, PhaseTurn.TAKE_DOWN)
     assert ending is (Phase.ENDED if phase is Phase.ENDED else Phase.ENDING)
-    assert {next_phase(ending, turn) for turn in PhaseTurn} <= {ending, Phase.ENDED}
+    assert {get_next_phase(ending, turn) for turn in PhaseTurn} <= {ending, Phase.ENDED}
 
 
 def test_a_run_is_held_and_released_only_between_its_start_and_its_stop():
-    assert next_phase(Phase.IDLE, PhaseTurn.HOLD) is Phase.IDLE
-    assert next_phase(Phase.IDLE, PhaseTurn.START) is Phase.RUNNING
-    assert next_phase(Phase.RUNNING, PhaseTurn.HOLD) is Phase.HELD
-    assert next_phase(Phase.HELD, PhaseTurn.RELEASE) is Phase.RUNNING
+    assert get_next_phase(Phase.IDLE, PhaseTurn.HOLD) is Phase.IDLE
+    assert get_next_phase(Phase.IDLE, PhaseTurn.START) is Phase.RUNNING
+    assert get_next_phase(Phase.RUNNING, PhaseTurn.HOLD) is Phase.HELD
+    assert get_next_phase(Phase.HELD, PhaseTurn.RELEASE) is Phase.RUNNING

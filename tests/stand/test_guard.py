@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from tests.stand.guard_bench import Bench, NotedFile
-from thermostand.foundation.clock import VirtualClock, WallClock, block_until, seconds_ns
+from thermostand.foundation.clock import VirtualClock, WallClock, block_until, to_ns
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading
 from thermostand.stand.fault import Fault
@@ -18,7 +18,7 @@ async def test_a_guard_that_fails_aborts_and_makes_safe():
     time = asyncio.create_task(bench.clock.run())
     with pytest.raises(KeyError):
         await bench.guard.run()
-    await bench.safety.tried()
+    await bench.safety.wait_until_tried()
     time.cancel()
     assert bench.log == ["stop guard_failed", "revoke", "safe"]
     text = "the guard failed (KeyError: 'channel')"
@@ -32,7 +32,7 @@ async def test_permits_may_be_renewed_while_every_rule_holds_and_the_guard_looks
     assert await bench.run_for(11.5)
     assert bench.guard.may_permit()
     assert bench.guard.is_on_time
-    bench.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(2.1))
+    bench.clock = VirtualClock(bench.clock.now_ns() + to_ns(2.1))
     bench.guard.clock = bench.clock
     assert not bench.guard.may_permit()  # nobody has looked for more than two periods
     assert not bench.guard.is_on_time
@@ -62,7 +62,7 @@ async def test_what_is_still_wrong_when_it_is_cleared_holds_before_anything_can_
     await bench.run_for(2)
     bench.clear()
     assert bench.guard.held == Fault("rule0", "it is so", "hold")
-    assert "it is so" in bench.guard.still_wrong()
+    assert "it is so" in bench.guard.describe_remaining_faults()
     assert bench.log == ["hold rule0", "revoke", "safe", "hold rule0", "revoke"]
     await bench.run_for(2)
     assert bench.log[5:] == ["safe"]
@@ -90,7 +90,7 @@ async def test_a_run_that_cannot_be_ended_does_not_keep_the_stand_from_being_mad
     bench.objecting = {0}
     with pytest.raises(KeyError):
         bench.guard.look()
-    await bench.safety.tried()
+    await bench.safety.wait_until_tried()
     assert bench.log == ["revoke", "safe"]
 
 
@@ -101,7 +101,7 @@ async def test_a_guard_that_was_kept_from_looking_says_so():
     watching = asyncio.create_task(bench.guard.run())
     while not bench.guard.may_permit():
         await asyncio.sleep(0)
-    block_until(bench.clock, bench.clock.now_ns() + seconds_ns(1.2))
+    block_until(bench.clock, bench.clock.now_ns() + to_ns(1.2))
     assert not bench.guard.may_permit()
     while not bench.events:
         await asyncio.sleep(0)
@@ -125,7 +125,7 @@ async def test_after_a_late_look_permits_wait_for_readings_taken_since():
     read("regulator.pv", "thermometers.air")
     await bench.run_for(3)
     assert bench.guard.may_permit()
-    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(13))
+    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + to_ns(13))
     assert bench.guard.look()
     assert [event.kind for event in bench.events] == ["guard_late"]
     read("regulator.pv", "thermometers.air")
@@ -142,7 +142,7 @@ async def test_after_a_late_look_what_could_not_be_renewed_has_time_to_be():
     bench = Bench("abort", "hold")
     bench.guard.watches[0].after_gap_s = 5.0
     await bench.run_for(3)
-    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(60))
+    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + to_ns(60))
     bench.objecting = {0}
     assert bench.guard.look()
     await bench.run_for(4)
@@ -160,7 +160,7 @@ async def test_after_a_late_look_what_is_not_renewed_in_time_trips_and_other_rul
         bench = Bench("abort", "abort")
         bench.guard.watches[0].after_gap_s = 5.0
         await bench.run_for(3)
-        bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(60))
+        bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + to_ns(60))
         bench.objecting = objecting
         bench.guard.look()
         await bench.run_for(within_s)
@@ -173,7 +173,7 @@ async def test_a_hold_does_not_end_because_its_cause_is_passed_over_after_a_late
     bench.guard.watches[0].ends_itself, bench.guard.watches[0].after_gap_s = True, 5.0
     bench.objecting = {0}
     await bench.run_for(3)
-    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + seconds_ns(60))
+    bench.clock = bench.guard.clock = VirtualClock(bench.clock.now_ns() + to_ns(60))
     await bench.run_for(10)
     assert bench.guard.held is not None
     assert bench.log == ["hold rule0", "revoke", "safe"]
@@ -262,8 +262,8 @@ async def test_clearing_restarts_the_grace_time_of_every_rule():
     watch.grace_s = 10.0
     bench.objecting = {0}
     await bench.run_for(8)
-    bench.guard.begin_again()
-    assert "it is so" in bench.guard.still_wrong()
+    bench.guard.reset_grace_times()
+    assert "it is so" in bench.guard.describe_remaining_faults()
     await bench.run_for(8)
     assert bench.guard.held is None
     await bench.run_for(4)
@@ -271,7 +271,7 @@ async def test_clearing_restarts_the_grace_time_of_every_rule():
     bench.objecting = set()
     bench.clear()
     await bench.run_for(1)
-    assert bench.guard.still_wrong() == ""
+    assert bench.guard.describe_remaining_faults() == ""
 
 
 async def test_a_fault_that_aborts_does_so_during_a_hold():
@@ -285,7 +285,7 @@ async def test_a_fault_that_aborts_does_so_during_a_hold():
 
 async def test_a_guard_that_keeps_on_looks_after_an_abort_which_stays_until_it_is_cleared():
     bench = Bench("hold", "abort")
-    bench.guard.keeps_on = True
+    bench.guard.keeps_running = True
     bench.objecting = {1}
     assert await bench.run_for(5)
     assert bench.log == ["stop rule1", "revoke", "safe"]  # once, though it still objects
@@ -314,7 +314,7 @@ async def test_what_only_an_operator_ends_is_latched_before_anything_else_is_don
         bench.objecting = {0}
         assert bench.guard.look() is (action == "hold")
         assert bench.log == log
-        await bench.safety.tried()
+        await bench.safety.wait_until_tried()
 
 
 async def test_without_a_way_to_hold_every_trip_aborts():

@@ -6,23 +6,23 @@ from collections.abc import Callable, Iterable
 import pytest
 import yaml
 
-from tests.nightly import by_night
-from tests.stand.guarded_chamber import Action, Chamber, timed
-from tests.stand.guarded_failures import FAILURES, HARMLESS, PHASES, Night, Outcome, table
+from tests.nightly import mark_nightly
+from tests.stand.guarded_chamber import Action, Chamber, iterate_timed
+from tests.stand.guarded_failures import FAILURES, HARMLESS, PHASES, FailureRun, Outcome, table
 from tests.stand.guarded_recipes import RECIPES, Player
 from thermostand.foundation.documents import parse_document
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.fault import Fault
-from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.guarding.rules import Announcements, make_watches
 
-CONFIG = load_config(packaged("", "simulated"))
+CONFIG = load_config(find_packaged("", "simulated"))
 LIMIT_DEGC = CONFIG.guard.max_air_degC + 3.0
 CHAMBERS = range(10)
 
 
 def with_thermometers(**thermometers: dict[str, object]) -> StandConfig:
     """The simulated stand with these alone, and no camera; one witness too few is accepted by name."""
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data |= {"thermometers": thermometers, "cameras": {}}
     if "ceiling" not in thermometers:
         data.setdefault("guard", {})["overrides"] = ["independent_air_sensor"]
@@ -40,9 +40,9 @@ BIG_STEPS_DEGC = (24.0, 60.0, -5.0, 60.0, 24.0, 27.0, 24.0)  # as no installed r
 
 def objections(chamber: Chamber, actions: Iterable[tuple[float, Action]], config: StandConfig = CONFIG) -> list[Fault]:
     """What the table says on the way, warnings too."""
-    rules = watches(config, Announcements())
+    rules = make_watches(config, Announcements())
     found: list[Fault] = []
-    for now_ns in timed(chamber, actions):
+    for now_ns in iterate_timed(chamber, actions):
         found.extend(fault for rule in rules if (fault := rule.check(chamber.hub, now_ns)) is not None)
     return [fault for fault in found if fault.rule != "flap_open"]  # nobody announces captures here
 
@@ -73,7 +73,7 @@ def check(found: Outcome, failure: str) -> None:
 def test_the_air_stays_below_its_limit_when_probes_fail(
     failure: str, phase: str, chamber_seed: int | None, hot_degC: float
 ):
-    check(Night(phase, CONFIG, chamber_seed, hot_degC).outcome(failure), failure)
+    check(FailureRun(phase, CONFIG, chamber_seed, hot_degC).outcome(failure), failure)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_the_air_stays_below_its_limit_when_probes_fail(
 def test_so_it_does_without_a_thermometer_in_the_granite(
     config: StandConfig, failure: str, phase: str, chamber_seed: int, hot_degC: float
 ):
-    check(Night(phase, config, chamber_seed, hot_degC).outcome(failure), failure)
+    check(FailureRun(phase, config, chamber_seed, hot_degC).outcome(failure), failure)
 
 
 @pytest.mark.nightly
@@ -101,11 +101,11 @@ def test_so_it_does_in_every_failure_without_a_thermometer_in_the_granite(phase:
     for chamber_seed in (None, *CHAMBERS):
         for config, hot_degC, but in ((SAFETY, 60.0, OF_GRANITE), (ALONE, 52.0, (*OF_GRANITE, *ALIKE))):
             failures = [failure for failure in FAILURES if failure not in but]
-            for failure, outcome in Night(phase, config, chamber_seed, hot_degC).outcomes(failures).items():
+            for failure, outcome in FailureRun(phase, config, chamber_seed, hot_degC).outcomes(failures).items():
                 check(outcome, failure)
 
 
-@pytest.mark.parametrize("set_points_degC", [BIG_STEPS_DEGC[1:4], by_night(BIG_STEPS_DEGC)])
+@pytest.mark.parametrize("set_points_degC", [BIG_STEPS_DEGC[1:4], mark_nightly(BIG_STEPS_DEGC)])
 def test_a_good_day_without_a_thermometer_in_the_granite_is_left_alone(set_points_degC: tuple[float, ...]):
     chamber = Chamber(1, camera_powered=False, channels={"air": 3})
     assert objections(chamber, big_steps(set_points_degC), ALONE) == []
@@ -120,13 +120,15 @@ def test_the_air_stays_below_its_limit_in_every_failure(
 ):
     found: dict[tuple[str, str], list[Outcome]] = {(f"{failure} at {hot_degC:g}", phase): [] for failure in FAILURES}
     for chamber_seed in (None, *CHAMBERS):
-        for failure, outcome in Night(phase, CONFIG, chamber_seed, hot_degC).outcomes(FAILURES).items():
+        for failure, outcome in FailureRun(phase, CONFIG, chamber_seed, hot_degC).outcomes(FAILURES).items():
             check(outcome, failure)
             found[f"{failure} at {hot_degC:g}", phase].append(outcome)
     record_property("outcome", table(found))
 
 
-@pytest.mark.parametrize(("recipe", "chamber_seed"), [("trial", 0), by_night("demo", 0), by_night("warm-up", 2)])
+@pytest.mark.parametrize(
+    ("recipe", "chamber_seed"), [("trial", 0), mark_nightly("demo", 0), mark_nightly("warm-up", 2)]
+)
 def test_a_good_night_is_left_alone(recipe: str, chamber_seed: int):
     assert objections(Chamber(chamber_seed), Player(recipe, interrupted=True).actions()) == []
 

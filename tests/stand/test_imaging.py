@@ -5,14 +5,14 @@ from typing import Any, cast
 
 import pytest
 
-from tests.stand.room_devices import Camera, Rooms, rooms, trip
+from tests.stand.memory_devices import Camera, MemoryStand, run_memory_stand, trip
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import StandTripped, Unreachable
 from thermostand.foundation.readings import Frame
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import CAMERA_LOST
-from thermostand.stand.imaging.camera_opening import LOST_LIMIT_S
+from thermostand.stand.imaging.camera_recovery import LOST_LIMIT_S
 from thermostand.stand.interlock import Interlocked
 
 HELD, ON, OFF = (f"relays {CAMERA_POWER} {how}" for how in ("held", "on", "off"))
@@ -22,21 +22,21 @@ def lost() -> Unreachable:
     return Unreachable("camera", "no answer")
 
 
-async def with_camera(here: Rooms) -> None:
+async def with_camera(here: MemoryStand) -> None:
     await here.stand.imaging.supply.switch_on()
     here.calls.clear()
     here.items.clear()
 
 
 async def test_a_frame_carries_the_step_that_asked_for_it():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         assert await here.stand.imaging.take_frame(0.01, "capture-1")
         assert [frame.step_id for frame in here.frames] == ["capture-1"]
 
 
 async def test_of_two_cameras_those_that_are_named_expose_and_no_other():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         cast("dict[str, Any]", here.stand.devices.cameras)["side"] = Camera("side", here.clock, here.calls)
         await with_camera(here)
         assert await here.stand.imaging.take_frame(0.01, "capture-1", cameras=("side",))
@@ -46,7 +46,7 @@ async def test_of_two_cameras_those_that_are_named_expose_and_no_other():
 
 async def test_of_two_captures_one_after_the_other_each_is_exposed_at_an_instant_of_its_own():
     """A frame is found again by its instant."""
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         assert await here.stand.imaging.take_frame(8.0, "capture-1")
         assert await here.stand.imaging.take_frame(8.0, "capture-2")
@@ -55,7 +55,7 @@ async def test_of_two_captures_one_after_the_other_each_is_exposed_at_an_instant
 
 
 async def test_a_lost_camera_holds_the_gate_until_it_is_open_and_gives_no_frame():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         here.camera.failures += [lost()] * 3  # the frame, and two openings
         taking = asyncio.create_task(here.stand.imaging.take_frame(0.01, "capture-1"))
@@ -74,7 +74,7 @@ async def test_a_camera_that_opens_and_never_gives_a_frame_ends_the_run_after_ha
     async def gives_none(*_: object) -> Frame:
         raise lost()
 
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         monkeypatch.setattr(here.camera, "grab", gives_none)
         assert not await here.stand.imaging.take_frame(0.01, "capture-1")
@@ -86,7 +86,7 @@ async def test_a_camera_that_opens_and_never_gives_a_frame_ends_the_run_after_ha
 
 
 async def test_a_look_opens_the_flap_for_its_frame_only_also_when_the_camera_is_lost():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         frame = await here.stand.imaging.look(0.01, "soak-1")
         assert frame is not None
@@ -97,7 +97,7 @@ async def test_a_look_opens_the_flap_for_its_frame_only_also_when_the_camera_is_
 
 
 async def test_after_a_trip_the_flap_closes_and_does_not_open():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         trip(here.stand, Fault("air_hot", "the air is too hot"))
         with pytest.raises(StandTripped):
             await here.stand.imaging.open_flap()
@@ -106,7 +106,7 @@ async def test_after_a_trip_the_flap_closes_and_does_not_open():
 
 
 async def test_a_supply_that_was_off_is_held_in_time_until_the_camera_answers():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await here.stand.imaging.supply.switch_on()
         assert here.calls == [HELD, "camera open", ON]
         assert (here.stand.imaging.supply.was_on, here.stand.imaging.supply.is_on) == (False, True)
@@ -116,7 +116,7 @@ async def test_a_supply_that_was_off_is_held_in_time_until_the_camera_answers():
 
 
 async def test_a_supply_that_was_on_is_never_interrupted():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         here.relays.on.add(CAMERA_POWER)
         await here.stand.imaging.supply.switch_on()
         assert here.calls == [ON, "camera open"]
@@ -124,7 +124,7 @@ async def test_a_supply_that_was_on_is_never_interrupted():
 
 
 async def test_a_camera_that_never_answers_leaves_its_relay_off():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         here.camera.failures += [lost()] * 100
         with pytest.raises(Unreachable, match=r"relays\.camera_power was on") as lost_one:
             await here.stand.imaging.supply.switch_on()
@@ -134,7 +134,7 @@ async def test_a_camera_that_never_answers_leaves_its_relay_off():
 
 
 async def test_a_supply_that_dropped_is_restored_with_the_gate_held():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         supply = here.stand.imaging.supply
         supply.compare({CAMERA_POWER: False})
@@ -148,22 +148,22 @@ async def test_a_supply_that_dropped_is_restored_with_the_gate_held():
 
 
 async def test_a_supply_that_was_cut_goes_off_with_every_demand_and_is_confirmed():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await with_camera(here)
         here.stand.latch.trip(Fault("air_hot", "the air is too hot"))
-        here.stand.latch.bar()
+        here.stand.latch.hold_gate()
         here.stand.cut_camera()
         assert not here.stand.imaging.supply.is_on
-        assert await here.stand.safety.confirmed(60)
+        assert await here.stand.safety.wait_until_confirmed(60)
         assert OFF in here.calls
         with pytest.raises(Interlocked):
             await here.stand.imaging.supply.switch_on()
         here.stand.cut_camera()
-        assert await here.stand.safety.confirmed(60)
+        assert await here.stand.safety.wait_until_confirmed(60)
         here.stand.latch.reset()
-        here.stand.safety.forgive()
+        here.stand.safety.cancel_pending()
         await here.stand.imaging.supply.switch_on()
         here.calls.clear()
         here.stand.safety.demand()
-        assert await here.stand.safety.confirmed(60)
+        assert await here.stand.safety.wait_until_confirmed(60)
         assert OFF not in here.calls, "an operator has looked: it is on again for good"

@@ -37,7 +37,7 @@ def test_options_say_what_is_connected_and_what_is_not_is_named(tmp_path: Path, 
     async def answer(addresses: list[str], wait_s: float) -> tuple[FoundCamera, ...]:
         return (FoundCamera(addresses[0], "A maker", "a model", "1.0", "00351210"),)
 
-    monkeypatch.setattr(init_cli, "cameras_at", answer)
+    monkeypatch.setattr(init_cli, "find_cameras", answer)
     options = ("--bus", "/dev/serial/by-id/x", "--camera", "10.0.0.7", "--axis", "linear=/dev/ximc/00001007:4103")
     done = invoke(tmp_path, "--name", 'a "stand"', "--no-ask", *options)
     assert done.exit_code == 0, done.stderr
@@ -58,8 +58,8 @@ def test_at_a_terminal_it_asks_among_what_is_connected(tmp_path: Path, monkeypat
         SerialPort("/dev/ximc/00001007", "a stage", ""),
     )
     monkeypatch.setattr(init_cli, "_is_terminal", lambda: True)
-    monkeypatch.setattr(init_cli, "serial_ports", lambda: ports)
-    monkeypatch.setattr(init_cli, "usb_devices", lambda: (UsbDevice(0x1FFB, 0xB7, "the flap", "00001234"),))
+    monkeypatch.setattr(init_cli, "list_serial_ports", lambda: ports)
+    monkeypatch.setattr(init_cli, "list_usb_devices", lambda: (UsbDevice(0x1FFB, 0xB7, "the flap", "00001234"),))
     done = invoke(
         tmp_path / "mine", answers="1\n0\n2\n1\n\n"
     )  # linear, rotary, bus, flap, camera; no gateway, as there is a bus
@@ -73,8 +73,8 @@ def test_at_a_terminal_it_asks_among_what_is_connected(tmp_path: Path, monkeypat
 @pytest.mark.parametrize("answer", ["10.0.0.9", "tcp:10.0.0.9:502", "10.0.0.9:502"])
 def test_it_asks_for_a_gateway_where_no_adapter_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str):
     monkeypatch.setattr(init_cli, "_is_terminal", lambda: True)
-    monkeypatch.setattr(init_cli, "serial_ports", tuple)
-    monkeypatch.setattr(init_cli, "usb_devices", tuple)
+    monkeypatch.setattr(init_cli, "list_serial_ports", tuple)
+    monkeypatch.setattr(init_cli, "list_usb_devices", tuple)
     asked = invoke(tmp_path / "asked", answers=f"{answer}\n\n")  # gateway, camera
     given = invoke(tmp_path / "given", "--no-ask", "--bus", answer)
     assert (asked.exit_code, given.exit_code) == (0, 0), asked.stderr

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask, ask_status
-from tests.stand.a_desk import STATUS, ADesk, served
+from tests.daemon_queries import ask, ask_status
+from tests.stand.fake_service import STATUS, FakeService, serve_fake
 from tests.stand.interface_client import entries_of, obeys
 from thermostand.foundation.errors import SessionError
-from thermostand.stand.serving.client import running_sessions
-from thermostand.stand.serving.presence import address_in, living, opened_folder
+from thermostand.stand.serving.client import list_running_sessions
+from thermostand.stand.serving.instances import list_daemons, make_socket_address, open_folder
 
 HEALTH = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
 STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -22,9 +22,9 @@ STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 async def connect(session: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     """To the daemon that runs `session`, over the few characters that a socket's path may have."""
-    (daemon,) = [each for each in living() if each.entry.session == str(session)]
-    with opened_folder(daemon.socket.parent) as folder:
-        return await asyncio.open_unix_connection(address_in(folder, daemon.socket.name))
+    (daemon,) = [each for each in list_daemons() if each.entry.session == str(session)]
+    with open_folder(daemon.socket.parent) as folder:
+        return await asyncio.open_unix_connection(make_socket_address(folder, daemon.socket.name))
 
 
 async def reply(reader: asyncio.StreamReader) -> tuple[int, dict[str, object]]:
@@ -69,7 +69,7 @@ async def answers(session: Path, sent: bytes) -> list[tuple[int, dict[str, objec
     ],
 )
 async def test_garbage_is_answered_with_a_sentence_and_hurts_nobody(tmp_path: Path, sent: bytes):
-    async with served(ADesk(), tmp_path) as desk:
+    async with serve_fake(FakeService(), tmp_path) as desk:
         for status, answer in await answers(tmp_path, sent):  # the kernel may drop what a sender is cut off with
             assert status == 400
             assert "no HTTP request" in str(answer["error"])
@@ -79,7 +79,7 @@ async def test_garbage_is_answered_with_a_sentence_and_hurts_nobody(tmp_path: Pa
 
 
 async def test_requests_arrive_whole_byte_by_byte_and_many_at_once(tmp_path: Path):
-    async with served(ADesk(), tmp_path):
+    async with serve_fake(FakeService(), tmp_path):
         assert [status for status, _ in await answers(tmp_path, HEALTH * 3)] == [200]  # each answer ends its connection
         reader, writer = await connect(tmp_path)
         for byte in STOP:
@@ -92,7 +92,7 @@ async def test_requests_arrive_whole_byte_by_byte_and_many_at_once(tmp_path: Pat
 
 
 async def test_a_client_that_hangs_up_half_way_harms_nobody(tmp_path: Path):
-    async with served(ADesk(), tmp_path):
+    async with serve_fake(FakeService(), tmp_path):
         for sent in (b"", STOP[:20], HEALTH * 300):
             _, writer = await connect(tmp_path)
             writer.write(sent)
@@ -103,13 +103,13 @@ async def test_a_client_that_hangs_up_half_way_harms_nobody(tmp_path: Path):
 async def test_a_request_that_ends_the_daemon_is_still_answered(tmp_path: Path):
     ended = asyncio.Event()
 
-    class Ending(ADesk):
+    class Ending(FakeService):
         def stop(self, who):
             ended.set()
             return super().stop(who)
 
     async def daemon() -> None:
-        async with served(Ending(), tmp_path):
+        async with serve_fake(Ending(), tmp_path):
             await ended.wait()
 
     running = asyncio.create_task(daemon())
@@ -122,7 +122,7 @@ async def test_a_request_that_ends_the_daemon_is_still_answered(tmp_path: Path):
 
 async def test_ending_does_not_wait_for_a_client_that_neither_asks_nor_reads(tmp_path: Path):
     async with asyncio.timeout(5):
-        async with served(ADesk(), tmp_path):
+        async with serve_fake(FakeService(), tmp_path):
             reader, writer = await connect(tmp_path)
             await answers(tmp_path, HEALTH)
         assert await reader.read() == b""
@@ -134,8 +134,8 @@ async def test_only_its_user_may_reach_the_socket_whatever_the_umask(tmp_path: P
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     before = os.umask(0)
     try:
-        async with served(ADesk(), tmp_path):
-            (daemon,) = [each for each in living() if each.entry.session == str(tmp_path)]
+        async with serve_fake(FakeService(), tmp_path):
+            (daemon,) = [each for each in list_daemons() if each.entry.session == str(tmp_path)]
             files = daemon.socket.parent.glob("[!.]*")  # one that is being written is there for a moment
             modes = [stat.S_IMODE(path.stat().st_mode) for path in (daemon.socket.parent, *files)]
     finally:
@@ -148,15 +148,15 @@ async def test_paths_longer_than_the_kernel_takes_are_served(tmp_path: Path, mon
     session.mkdir(parents=True)
     runtime.mkdir(parents=True)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    async with served(ADesk(), session):
+    async with serve_fake(FakeService(), session):
         assert await asyncio.to_thread(obeys, session)
-        assert await asyncio.to_thread(running_sessions, session.parent) == [session]
+        assert await asyncio.to_thread(list_running_sessions, session.parent) == [session]
     assert list(session.iterdir()) == []
     assert list((runtime / "thermostand").iterdir()) == []
 
 
 async def test_an_operator_holds_releases_clears_and_stops_the_run(tmp_path: Path):
-    async with served(ADesk("interlock", run=STATUS), tmp_path) as desk:
+    async with serve_fake(FakeService("interlock", run=STATUS), tmp_path) as desk:
 
         async def do(what: str) -> dict[str, object]:
             return await asyncio.to_thread(ask, tmp_path, what)

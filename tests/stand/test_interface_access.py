@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from websockets.asyncio.client import connect
 
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.config.interface_section import TokenFile
 from thermostand.stand.serving.api import access
@@ -23,11 +23,11 @@ from thermostand.stand.serving.api.access import (
     INVITE_PATH,
     STOP_PATH,
     Access,
-    TokenBook,
-    is_open,
+    TokenStore,
+    is_exempt_from_token,
 )
-from thermostand.stand.serving.api.doors import Interface, OtherDoor
-from thermostand.stand.serving.client import server_at
+from thermostand.stand.serving.api.listeners import Interface, ProtocolListener
+from thermostand.stand.serving.client import make_server
 
 TOKEN, LOOKS = "correct-horse-battery-staple", "only-looks-and-stops-for-wall"
 CHANGES_NOTHING = (STOP_PATH, CHECK_PATH, INVITE_PATH)
@@ -57,9 +57,9 @@ HOSTILE = (
 BARE_PROXY = "anybody behind a proxy on this machine that adds no header"
 
 
-def book(**read_only: str) -> TokenBook:
+def book(**read_only: str) -> TokenStore:
     """With rose's token, and these."""
-    return TokenBook(TokenFile(tokens={"rose": TOKEN}, read_only=read_only))
+    return TokenStore(TokenFile(tokens={"rose": TOKEN}, read_only=read_only))
 
 
 def free_port() -> int:
@@ -69,11 +69,11 @@ def free_port() -> int:
 
 
 @asynccontextmanager
-async def open_stand(folder: Path, *, trusts_loopback: bool = True) -> AsyncIterator[tuple[ADesk, int]]:
+async def open_stand(folder: Path, *, trusts_loopback: bool = True) -> AsyncIterator[tuple[FakeService, int]]:
     port = free_port()
     hosts = ("stand.example",)
     interface = Interface(folder, port=port, tokens=book(wall=LOOKS), hosts=hosts, trusts_loopback=trusts_loopback)
-    async with served(ADesk(), folder / "night", interface) as desk:
+    async with serve_fake(FakeService(), folder / "night", interface) as desk:
         yield desk, port
 
 
@@ -131,7 +131,7 @@ async def test_every_route_refuses(tmp_path: Path, attack: str, headers: dict[st
         assert len(found) > 25
         for method, path in found:
             got, answered, body = await asyncio.to_thread(ask, port, method, path, headers)
-            refused = of_host or (method != "GET" if status == 403 else not is_open(path))
+            refused = of_host or (method != "GET" if status == 403 else not is_exempt_from_token(path))
             if looks:
                 refused = method != "GET" and path not in CHANGES_NOTHING
             if status == 401 and "Authorization" in headers:
@@ -175,7 +175,7 @@ async def test_with_a_token_a_cookie_or_from_here_it_is_served(tmp_path: Path):
         assert (await asyncio.to_thread(ask, port, "POST", "/api/v1/run/pause", shown))[0] == 200
         file = tmp_path / "token"
         file.write_text(TOKEN + "\n")
-        assert (await asyncio.to_thread(server_at(f"http://127.0.0.1:{port}", file).order, "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(make_server(f"http://127.0.0.1:{port}", file).order, "stop"))["verb"] == "stop"
     assert [(who.name, who.how) for who, _, _ in desk.orders] == [
         ("rose", "token"),
         ("", "loopback"),
@@ -276,7 +276,7 @@ def test_a_wide_bind_without_a_token_is_refused(tmp_path: Path):
         Interface(tmp_path, host=host, port=1, tokens=book()).check()
     for host in ("127.0.0.1", "::1", "localhost", "127.1.2.3"):
         Interface(tmp_path, host=host, port=1).check()
-    other = OtherDoor("--secop", "127.0.0.1", 1, lambda *_: asyncio.sleep(0))
+    other = ProtocolListener("--secop", "127.0.0.1", 1, lambda *_: asyncio.sleep(0))
     Interface(tmp_path, doors=(other,)).check()
     Interface(tmp_path, tokens=book(), doors=(other,), trusts_loopback=True).check()
     with pytest.raises(ConfigError, match=r"--secop: .* set interface\.trust_loopback: true"):
@@ -288,7 +288,7 @@ async def test_a_port_that_is_taken_is_said_to(tmp_path: Path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         interface = Interface(tmp_path, port=taken.getsockname()[1])
         with pytest.raises(ConfigError, match="cannot listen at"):
-            async with served(ADesk(), tmp_path / "night", interface):
+            async with serve_fake(FakeService(), tmp_path / "night", interface):
                 pass
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from tests import forked
-from tests.asking import ask, ask_status
-from tests.stand.a_desk import STAND, ADesk, served
+from tests import fork_server
+from tests.daemon_queries import ask, ask_status
+from tests.stand.fake_service import STAND, FakeService, serve_fake
 from tests.stand.interface_client import DAEMON, entries_of, obeys
 from thermostand.foundation.errors import SessionError
-from thermostand.stand.serving import presence as runtime
-from thermostand.stand.serving.client import running_sessions, server_of
-from thermostand.stand.serving.presence import DaemonEntry, Presence
+from thermostand.stand.serving import instances as runtime
+from thermostand.stand.serving.client import find_session_server, list_running_sessions
+from thermostand.stand.serving.instances import DaemonEntry, DaemonInstance
 
 
 async def folder_stated(session: Path) -> None:
@@ -33,7 +33,7 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
     old.mkdir(parents=True)
     new.parent.mkdir()
     (tmp_path / "link").symlink_to(old.parent)
-    async with served(ADesk(), old):
+    async with serve_fake(FakeService(), old):
         await folder_stated(old)
 
         async def reached() -> list[object]:
@@ -41,13 +41,13 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
             names = [old, new, tmp_path / "link" / "old", Path(os.path.relpath(old))]
             found = [name for name in names if await asyncio.to_thread(obeys, name)]
             roots = (old.parent, new.parent, tmp_path / "link")
-            return [found == names, *[await asyncio.to_thread(running_sessions, root) for root in roots]]
+            return [found == names, *[await asyncio.to_thread(list_running_sessions, root) for root in roots]]
 
         assert await reached() == [False, [old], [], [tmp_path / "link" / "old"]]
         old.rename(new)
         assert await reached() == [True, [old], [new], [tmp_path / "link" / "old"]]
         new.rename(new.with_name("newer"))
-        assert await asyncio.to_thread(running_sessions, new.with_name("newer")) == [new.with_name("newer")]
+        assert await asyncio.to_thread(list_running_sessions, new.with_name("newer")) == [new.with_name("newer")]
         shutil.rmtree(new.parent)
         assert await asyncio.to_thread(obeys, old)
         assert not await asyncio.to_thread(obeys, new)
@@ -57,15 +57,15 @@ async def test_two_daemons_with_one_name_are_distinguished_by_the_folder(tmp_pat
     """The first one's session was renamed, and the next run took its name."""
     session, away = tmp_path / "night", tmp_path / "renamed"
     session.mkdir()
-    async with served(ADesk("first"), session):
+    async with serve_fake(FakeService("first"), session):
         await folder_stated(session)
         session.rename(away)
         session.mkdir()
-        async with served(ADesk("second"), session):
+        async with serve_fake(FakeService("second"), session):
             while len([entry for entry in entries_of(session) if entry.identity]) < 2:
                 await asyncio.sleep(0.01)
-            assert (await asyncio.to_thread(server_of(away).state)).reasons == ("first",)
-            assert (await asyncio.to_thread(server_of(session).state)).reasons == ("second",)
+            assert (await asyncio.to_thread(find_session_server(away).state)).reasons == ("first",)
+            assert (await asyncio.to_thread(find_session_server(session).state)).reasons == ("second",)
 
 
 async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -73,7 +73,7 @@ async def test_a_socket_that_somebody_removed_comes_back(tmp_path: Path, monkeyp
     runtime = tmp_path / "runtime"
     runtime.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    async with served(ADesk(), tmp_path), asyncio.timeout(30):
+    async with serve_fake(FakeService(), tmp_path), asyncio.timeout(30):
         shutil.rmtree(runtime / "thermostand")
         with pytest.raises(SessionError, match="no daemon is running"):
             await asyncio.to_thread(ask, tmp_path, "stop")
@@ -87,7 +87,7 @@ def daemon() -> Iterator[Callable[[Path], "subprocess.Popen[str]"]]:
     started = []
 
     def start(session: Path) -> "subprocess.Popen[str]":
-        process = forked.popen(
+        process = fork_server.popen(
             [sys.executable, "-m", "tests.code", DAEMON, str(session)], stdout=subprocess.PIPE, text=True
         )
         started.append(process)
@@ -117,8 +117,8 @@ async def test_what_a_killed_daemon_left_is_nobodys_and_is_removed(
     with pytest.raises(SessionError, match="is running this session"):
         ask(tmp_path, "stop")
     assert list(runtime_folder.iterdir()) == []
-    assert running_sessions(tmp_path.parent) == []
-    async with served(ADesk(), tmp_path):
+    assert list_running_sessions(tmp_path.parent) == []
+    async with serve_fake(FakeService(), tmp_path):
         assert await asyncio.to_thread(obeys, tmp_path)
 
 
@@ -134,27 +134,27 @@ async def test_a_runtime_folder_of_somebody_else_is_not_used(tmp_path: Path, mon
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "thermostand").symlink_to(tmp_path)
     with pytest.raises(SessionError, match="set XDG_RUNTIME_DIR"):
-        async with served(ADesk(), tmp_path):
+        async with serve_fake(FakeService(), tmp_path):
             pass
     (tmp_path / "thermostand").unlink()
     (tmp_path / "thermostand").write_text("mine")
     with pytest.raises(SessionError, match="cannot be made"):
-        async with served(ADesk(), tmp_path):
+        async with serve_fake(FakeService(), tmp_path):
             pass
     (tmp_path / "thermostand").unlink()
     (tmp_path / "thermostand").mkdir(mode=0o755)
-    assert stat.S_IMODE(runtime.runtime_folder().stat().st_mode) == 0o700
+    assert stat.S_IMODE(runtime.find_runtime_folder().stat().st_mode) == 0o700
 
 
 @pytest.mark.parametrize("named", ["", "relative", "/nonexistent"])
 def test_without_a_folder_of_the_login_the_systems_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str):
     monkeypatch.setattr(runtime, "SYSTEM_FOLDER", tmp_path / "lock")
     monkeypatch.setenv("XDG_RUNTIME_DIR", named)
-    assert runtime.runtime_folder() == tmp_path / "lock"
+    assert runtime.find_runtime_folder() == tmp_path / "lock"
     assert (tmp_path / "lock").is_dir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert runtime.runtime_folder() == tmp_path / "thermostand"
-    assert runtime.runtime_folders() == (tmp_path / "thermostand", tmp_path / "lock")  # daemons of both are found
+    assert runtime.find_runtime_folder() == tmp_path / "thermostand"
+    assert runtime.list_runtime_folders() == (tmp_path / "thermostand", tmp_path / "lock")  # daemons of both are found
 
 
 def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentence(tmp_path: Path):
@@ -180,12 +180,12 @@ async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: byt
         writer.write(said)
         writer.close()
 
-    presence = Presence(DaemonEntry(str(tmp_path), os.getpid(), STAND))
+    presence = DaemonInstance(DaemonEntry(str(tmp_path), os.getpid(), STAND))
     try:
-        everything, stop = presence.appear()
+        everything, stop = presence.publish()
         stop.close()
         async with await asyncio.start_unix_server(talk, sock=everything):
             with pytest.raises(SessionError, match=sentence):
                 await asyncio.to_thread(ask_status, tmp_path)
     finally:
-        presence.disappear()
+        presence.withdraw()

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from tests.stand.test_interface_access import ask, free_port
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 
 _QUICK, _LONG = 8, 400  # examples of each operation
 _REFUSED_UNREAD = 400
@@ -22,7 +22,7 @@ _REFUSED_UNREAD = 400
 lost with it."""
 
 
-class Broken(ADesk):
+class Broken(FakeService):
     """A desk of which one command fails in a way that nobody has thought of."""
 
     def reset(self, who):
@@ -106,8 +106,8 @@ def _of(prepared: Any) -> list[tuple[str, Any]]:
 @pytest.mark.parametrize("examples", [_QUICK, pytest.param(_LONG, marks=pytest.mark.nightly)])
 async def test_no_request_by_the_document_or_against_it_makes_a_500(tmp_path: Path, examples: int):
     port = free_port()
-    desk = ADesk("interlock")
-    async with served(desk, tmp_path / "night", Interface(tmp_path, port=port)):
+    desk = FakeService("interlock")
+    async with serve_fake(desk, tmp_path / "night", Interface(tmp_path, port=port)):
         wrong, seen = await asyncio.to_thread(fuzz, port, examples)
         assert (await asyncio.to_thread(answered, port, "GET", "/healthz", "", {}, b""))[0] == 200
     assert wrong == []
@@ -117,7 +117,7 @@ async def test_no_request_by_the_document_or_against_it_makes_a_500(tmp_path: Pa
 
 async def test_a_method_that_is_not_done_at_an_address_is_answered_with_those_that_are(tmp_path: Path):
     port = free_port()
-    async with served(ADesk(), tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(FakeService(), tmp_path / "night", Interface(tmp_path, port=port)):
         document = json.loads((await asyncio.to_thread(ask, port, "GET", "/openapi.json"))[2])
         for path, entry in document["paths"].items():
             status, headers, _ = await asyncio.to_thread(ask, port, "OPTIONS", path.replace("{run}", "1"))
@@ -129,7 +129,7 @@ async def test_what_fails_is_answered_with_a_sentence_published_as_an_event_and_
     port, desk = free_port(), Broken()
     events: list[str] = []
     desk.hub.subscribe(lambda item: events.append(getattr(item, "text", "")))
-    async with served(desk, tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(desk, tmp_path / "night", Interface(tmp_path, port=port)):
         for _ in range(3):
             status, text = await asyncio.to_thread(answered, port, "POST", "/api/v1/run/reset", "", {}, b"")
             assert (status, "ZeroDivisionError" in json.loads(text)["error"]) == (500, True)

@@ -36,7 +36,7 @@ def test_nothing_may_move_while_a_run_is_ended_or_something_is_latched_and_a_pau
         interlock.check()
     assert not isinstance(ended.value, Interlocked)  # which a step would wait for
     gate.clear(STOPPING)
-    latch.bar()
+    latch.hold_gate()
     assert gate.reasons == {OPERATOR, INTERLOCK}
     latch.reset()
     assert gate.reasons == {OPERATOR}

@@ -3,29 +3,29 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Cause, Quality, Reading, bad_reading
 from thermostand.stand.fault import Fault, Rule, Watch
 from thermostand.stand.guarding.interlocks import (
-    camera_temperature_bad,
-    contact,
-    disagreement,
-    flap_open,
-    folder_lost,
-    frames_stopped,
-    heat_uncontrolled,
-    intrusion,
-    not_recorded,
-    over_temperature,
-    permit_missing,
-    recording_ended,
-    reported_fault,
-    settings_changed,
-    stage_alarm,
-    stopped_while_permitted,
-    trustworthy,
+    forbid_changed_settings,
+    forbid_device_fault,
+    forbid_intrusion,
+    forbid_open_flap,
+    forbid_stage_alarm,
+    forbid_uncontrolled_heat,
+    limit_disagreement,
+    limit_temperature,
+    require_camera_temperature,
+    require_contact_state,
+    require_durable_recording,
+    require_frame_recording,
+    require_fresh_reading,
+    require_permit_relay,
+    require_recording_process,
+    require_regulator_running,
+    require_session_folder,
 )
 
 PV, AIR = "regulator.pv", "thermometers.air"
@@ -33,7 +33,7 @@ RUNNING, PERMIT = "regulator.running", "relays.heater_enable"
 
 
 def reading(value: float, time_s: float = 0.0, quality: Quality = Quality.GOOD) -> Reading:
-    return Reading(AIR, value, "degC", seconds_ns(time_s), quality)
+    return Reading(AIR, value, "degC", to_ns(time_s), quality)
 
 
 def hub_of(*readings: Reading) -> Hub:
@@ -62,7 +62,7 @@ def rule_of(fault: Fault | None) -> str | None:
     ("value", "trips"), [(64.9, False), (65.0, False), (65.1, True), (-20.0, False), (math.inf, True)]
 )
 def test_over_temperature_trips_above_its_limit(value: float, trips: bool):
-    fault = over_temperature(AIR, 65.0)(hub_of(reading(value)), 0)
+    fault = limit_temperature(AIR, 65.0)(hub_of(reading(value)), 0)
     assert (fault is not None) is trips
     if fault is not None:
         assert AIR in fault.text
@@ -71,14 +71,14 @@ def test_over_temperature_trips_above_its_limit(value: float, trips: bool):
 
 def test_a_camera_that_was_cut_off_too_warm_can_be_cleared_when_it_has_not_been_read_for_a_while():
     """Its supply is off and it will not be read; air that is not read is another rule's business."""
-    read_ns = seconds_ns(1000)
+    read_ns = to_ns(1000)
     hub = hub_of(
         reading(94.0), Reading("camera.temperature", 94.0, "degC", read_ns), bad_reading(AIR, "degC", 1, "", "wire")
     )
-    camera, air = over_temperature("camera.temperature", 85.0, cuts_camera=True), over_temperature(AIR, 65.0)
-    assert camera(hub, read_ns + seconds_ns(60)) is not None
-    assert camera(hub, read_ns + seconds_ns(61)) is None
-    assert air(hub, seconds_ns(3600)) is not None
+    camera, air = limit_temperature("camera.temperature", 85.0, cuts_camera=True), limit_temperature(AIR, 65.0)
+    assert camera(hub, read_ns + to_ns(60)) is not None
+    assert camera(hub, read_ns + to_ns(61)) is None
+    assert air(hub, to_ns(3600)) is not None
 
 
 STALE = Quality.STALE
@@ -88,10 +88,10 @@ STALE = Quality.STALE
     ("readings", "rule"),
     [
         ([], "sensor_missing"),
-        ([reading(24.0, 99.0), bad_reading(AIR, "degC", seconds_ns(100), "open wire")], None),
-        ([bad_reading(AIR, "degC", seconds_ns(100), "open wire")], "sensor_bad"),
-        ([reading(24.0, 86.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire")], None),
-        ([reading(24.0, 84.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire")], "sensor_bad"),
+        ([reading(24.0, 99.0), bad_reading(AIR, "degC", to_ns(100), "open wire")], None),
+        ([bad_reading(AIR, "degC", to_ns(100), "open wire")], "sensor_bad"),
+        ([reading(24.0, 86.0), bad_reading(AIR, "degC", to_ns(100), "late", "wire")], None),
+        ([reading(24.0, 84.0), bad_reading(AIR, "degC", to_ns(100), "late", "wire")], "sensor_bad"),
         ([reading(24.0, 84.0)], "sensor_stale"),
         ([reading(24.0, 86.0)], None),
         ([reading(24.0, 90.0), reading(24.0, 100.0, STALE)], None),
@@ -112,7 +112,7 @@ STALE = Quality.STALE
     ],
 )
 def test_a_safety_sensor_must_be_there_good_and_fresh(readings: list[Reading], rule: str | None):
-    assert rule_of(trustworthy(AIR, 15.0)(hub_of(*readings), seconds_ns(100))) == rule
+    assert rule_of(require_fresh_reading(AIR, 15.0)(hub_of(*readings), to_ns(100))) == rule
 
 
 @pytest.mark.parametrize(
@@ -134,10 +134,10 @@ def test_bad_by_the_device_counts_at_the_second_poll_and_bad_by_the_wire_when_it
     polls: str, trips_at: int | None
 ):
     """One letter a poll: good, stale, bad by the wire, by the device, or by nobody knows whom; looked at twice each."""
-    hub, rule, trips = Hub(), trustworthy(AIR, 15.0), list[int]()
+    hub, rule, trips = Hub(), require_fresh_reading(AIR, 15.0), list[int]()
     causes: dict[str, Cause] = {"w": "wire", "d": "device", "u": ""}
     for index, letter in enumerate(polls):
-        now_ns = seconds_ns(100 + index)
+        now_ns = to_ns(100 + index)
         if letter in causes:
             polled = bad_reading(AIR, "degC", now_ns, "no sense", causes[letter])
         else:
@@ -149,9 +149,9 @@ def test_bad_by_the_device_counts_at_the_second_poll_and_bad_by_the_wire_when_it
 
 
 def test_a_device_that_was_good_between_two_looks_begins_again():
-    hub, rule = hub_of(reading(24.0, 99.0)), trustworthy(AIR, 15.0)
+    hub, rule = hub_of(reading(24.0, 99.0)), require_fresh_reading(AIR, 15.0)
     for time_s in (100, 101, 102, 103):
-        bad = bad_reading(AIR, "degC", seconds_ns(time_s), "open wire")
+        bad = bad_reading(AIR, "degC", to_ns(time_s), "open wire")
         hub.publish(Batch("thermometers", bad.time_ns, (bad,)))
         assert rule(hub, bad.time_ns) is None
         good = reading(24.0, time_s + 0.5)
@@ -160,25 +160,25 @@ def test_a_device_that_was_good_between_two_looks_begins_again():
 
 def test_rules_know_the_last_value_over_a_poll_that_was_lost_on_the_wire():
     """Else a line that loses a reply now and then would let each rule that needs time begin again."""
-    hub = hub_of(reading(70.0, 99.0), bad_reading(AIR, "degC", seconds_ns(100), "late", "wire"))
-    assert rule_of(over_temperature(AIR, 65.0)(hub, seconds_ns(100))) == "over_temperature"
+    hub = hub_of(reading(70.0, 99.0), bad_reading(AIR, "degC", to_ns(100), "late", "wire"))
+    assert rule_of(limit_temperature(AIR, 65.0)(hub, to_ns(100))) == "over_temperature"
     reported = Reading("regulator.fault", 1.0, "1", 0, reason="manual")
-    hub = hub_of(reported, bad_reading("regulator.fault", "1", seconds_ns(1), "late", "wire"))
-    assert rule_of(reported_fault("regulator.fault")(hub, seconds_ns(1))) == "device_fault"
+    hub = hub_of(reported, bad_reading("regulator.fault", "1", to_ns(1), "late", "wire"))
+    assert rule_of(forbid_device_fault("regulator.fault")(hub, to_ns(1))) == "device_fault"
 
 
 @pytest.mark.parametrize(
     ("air_degC", "trips"), [(24.0, False), (30.0, False), (30.1, True), (17.9, True), (math.nan, False)]
 )
 def test_two_sensors_of_one_air_may_differ_by_so_much(air_degC: float, trips: bool):
-    fault = disagreement(PV, AIR, 6.0)(hub_with(regulator_pv=24.0, thermometers_air=air_degC), 0)
+    fault = limit_disagreement(PV, AIR, 6.0)(hub_with(regulator_pv=24.0, thermometers_air=air_degC), 0)
     assert (fault is not None) is trips
     if fault is not None:
         assert fault.text.startswith("regulator.pv 24.00 degC and thermometers.air")
 
 
 def test_a_device_that_reports_a_fault_is_believed():
-    rule = reported_fault("regulator.fault")
+    rule = forbid_device_fault("regulator.fault")
     assert rule(hub_with(regulator_fault=0.0), 0) is None
     assert rule(hub_with(regulator_fault=math.nan), 0) is None
     reported = Reading("regulator.fault", 1.0, "1", 0, reason="set point changed at the unit")
@@ -201,7 +201,7 @@ def test_a_device_that_reports_a_fault_is_believed():
 )
 def test_regulator_and_permit_belong_together(running: float, permit: float, objection: str | None):
     hub = hub_with(regulator_running=running, relays_heater_enable=permit)
-    objections = [rule_of(rule(RUNNING, PERMIT)(hub, 0)) for rule in (stopped_while_permitted, permit_missing)]
+    objections = [rule_of(rule(RUNNING, PERMIT)(hub, 0)) for rule in (require_regulator_running, require_permit_relay)]
     assert [name for name in objections if name] == ([objection] if objection else [])
 
 
@@ -217,18 +217,18 @@ def test_regulator_and_permit_belong_together(running: float, permit: float, obj
 )
 def test_only_an_alarm_of_a_stage_is_one(reason: str, cause: Cause, trips: bool):
     position = Reading("linear.position", 1.0, "mm", 0, STALE if reason else Quality.GOOD, reason, cause)
-    assert (rule_of(stage_alarm("linear.position")(hub_of(position), 0)) == "stage_alarm") is trips
+    assert (rule_of(forbid_stage_alarm("linear.position")(hub_of(position), 0)) == "stage_alarm") is trips
 
 
 def test_a_stage_that_is_set_otherwise_is_a_warning():
     homed = Reading("linear.homed", 1.0, "1", 0, reason="speed 500 steps/s, not 1000 steps/s as in its profile")
-    assert rule_of(settings_changed("linear.homed")(hub_of(homed), 0)) == "settings_changed"
-    assert rule_of(settings_changed("linear.homed")(hub_of(replace(homed, reason="")), 0)) is None
+    assert rule_of(forbid_changed_settings("linear.homed")(hub_of(homed), 0)) == "settings_changed"
+    assert rule_of(forbid_changed_settings("linear.homed")(hub_of(replace(homed, reason="")), 0)) is None
 
 
 def test_an_open_flap_may_be_excused():
     excuse = [False]
-    rule = flap_open("flap.position", lambda: excuse[0])
+    rule = forbid_open_flap("flap.position", lambda: excuse[0])
     assert rule(hub_with(flap_position=0.02), 0) is None
     assert rule(hub_with(flap_position=math.nan), 0) is None
     assert rule_of(rule(hub_with(flap_position=0.3), 0)) == "flap_open"
@@ -238,19 +238,19 @@ def test_an_open_flap_may_be_excused():
 
 def test_a_recorder_that_takes_no_frames_is_reported_with_its_reason():
     reason = [""]
-    rule = frames_stopped(lambda: reason[0])
+    rule = require_frame_recording(lambda: reason[0])
     assert rule(Hub(), 0) is None
     reason[0] = "less than 2.0 GB free"
     assert rule(Hub(), 0) == Fault("disk_low", "less than 2.0 GB free")
 
 
 def objecting(instants: set[int]) -> Rule:
-    return lambda readings, now_ns: Fault("rule", "it is so") if now_ns // seconds_ns(1) in instants else None
+    return lambda readings, now_ns: Fault("rule", "it is so") if now_ns // to_ns(1) in instants else None
 
 
 def test_a_watch_waits_until_its_rule_has_objected_without_a_break_for_its_grace_time():
     watch = Watch(objecting({1, 2, 4, 5, 6, 7, 8}), grace_s=3.0, action="hold")
-    seen = {second: watch.check(Hub(), seconds_ns(second)) for second in range(10)}
+    seen = {second: watch.check(Hub(), to_ns(second)) for second in range(10)}
     expected = Fault("rule", "it is so, for 3 s", "hold")
     assert {second for second, fault in seen.items() if fault is not None} == {7, 8}
     assert seen[7] == expected
@@ -269,11 +269,15 @@ class Recorder:
 
 def test_what_is_not_recorded_in_time_or_cannot_be_any_more_is_a_fault():
     readings, recorder = Hub(), Recorder()
-    late, moved, ended = not_recorded(recorder, 10.0), folder_lost(recorder), recording_ended(recorder)
-    assert [rule(readings, seconds_ns(100)) for rule in (late, moved, ended)] == [None] * 3
-    recorder.waiting_since_ns = seconds_ns(90)
-    assert late(readings, seconds_ns(100)) is None
-    fault = late(readings, seconds_ns(102))
+    late, moved, ended = (
+        require_durable_recording(recorder, 10.0),
+        require_session_folder(recorder),
+        require_recording_process(recorder),
+    )
+    assert [rule(readings, to_ns(100)) for rule in (late, moved, ended)] == [None] * 3
+    recorder.waiting_since_ns = to_ns(90)
+    assert late(readings, to_ns(100)) is None
+    fault = late(readings, to_ns(102))
     assert rule_of(fault) == "not_recorded"
     assert fault is not None
     assert "12 s ago" in fault.text
@@ -283,9 +287,9 @@ def test_what_is_not_recorded_in_time_or_cannot_be_any_more_is_a_fault():
 
 def test_heat_that_others_switch_on_twice_and_heat_that_does_not_obey_are_faults():
     for times, rule in ((0, None), (1, None), (2, "switched_on_without_permission")):
-        assert rule_of(intrusion(lambda times=times: times)(Hub(), 0)) == rule
-    assert heat_uncontrolled(lambda: "")(Hub(), 0) is None
-    assert rule_of(heat_uncontrolled(lambda: "it reads back 30 %")(Hub(), 0)) == "heat_uncontrolled"
+        assert rule_of(forbid_intrusion(lambda times=times: times)(Hub(), 0)) == rule
+    assert forbid_uncontrolled_heat(lambda: "")(Hub(), 0) is None
+    assert rule_of(forbid_uncontrolled_heat(lambda: "it reads back 30 %")(Hub(), 0)) == "heat_uncontrolled"
 
 
 def test_a_cameras_temperature_that_is_lost_is_a_fault_while_frames_are_to_come():
@@ -297,11 +301,11 @@ def test_a_cameras_temperature_that_is_lost_is_a_fault_while_frames_are_to_come(
         (good, True, None),
         (None, True, None),
     ):
-        asked = camera_temperature_bad(channel, lambda to_come=to_come: to_come)
+        asked = require_camera_temperature(channel, lambda to_come=to_come: to_come)
         assert rule_of(asked(hub_of(found) if found else Hub(), 0)) == rule
 
 
 @pytest.mark.parametrize(("value", "trips"), [(1.0, True), (0.0, False), (math.nan, False), (None, False)])
 def test_a_contact_is_a_fault_in_the_state_that_is_one(value: float | None, trips: bool):
     hub = Hub() if value is None else hub_with(inputs_door=value)
-    assert (contact("inputs.door", 1.0, "the door is open")(hub, 0) is not None) is trips
+    assert (require_contact_state("inputs.door", 1.0, "the door is open")(hub, 0) is not None) is trips

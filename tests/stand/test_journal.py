@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.journals import MARK, lines_with, read_lines
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.format.journal_lines import journal_lines, lines_of
+from thermostand.recording.format.journal_lines import format_lines, parse_lines
 from thermostand.stand.running.memory.entries import (
     Begun,
     Ended,
@@ -24,9 +24,9 @@ from thermostand.stand.running.memory.entries import (
     Soaked,
     StepChanged,
     Tripped,
-    decoded,
+    decode,
 )
-from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, taken_over
+from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, take_over
 
 ENTRIES = [
     Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),
@@ -140,12 +140,12 @@ def test_lines_of_another_place_or_journal_do_not_count(tmp_path):
     moved = b"".join([*lines[:2], lines[5], *lines[3:]])
     foreign = other[: len(lines[0])] + whole[len(lines[0]) :]
     for data, lost in ((moved, 2), (foreign, 0)):
-        found = lines_of(data)
-        assert [text for text in found.sound if decoded(text) not in ENTRIES] == []
+        found = parse_lines(data)
+        assert [text for text in found.sound if decode(text) not in ENTRIES] == []
         assert lost + 1 in found.damaged
         assert len(found.sound) < len(ENTRIES)
-    assert lines_of(foreign).damaged == (1,)
-    assert lines_of(other).damaged == ()
+    assert parse_lines(foreign).damaged == (1,)
+    assert parse_lines(other).damaged == ()
 
 
 def test_a_second_damage_is_kept_aside_as_well(tmp_path):
@@ -200,7 +200,7 @@ def test_no_journal_and_a_second_one_are_refused_with_a_sentence(tmp_path):
 
 @pytest.mark.parametrize("line", [b'{"entry": "Teleported", "time_ns": 1}', b'{"entry": "Gap", "to": 1}', b"[]", b"x"])
 def test_a_whole_line_of_another_version_is_refused_with_a_sentence(tmp_path, line):
-    (tmp_path / JOURNAL_NAME).write_bytes(journal_lines([line], MARK))
+    (tmp_path / JOURNAL_NAME).write_bytes(format_lines([line], MARK))
     with pytest.raises(SessionError, match="another version"):
         Journal.open(tmp_path)
     (tmp_path / JOURNAL_NAME).unlink()
@@ -244,18 +244,18 @@ async def test_a_journal_that_was_removed_is_written_again_with_all_its_lines_an
     journal, path = Journal.create(tmp_path), tmp_path / JOURNAL_NAME
     journal.start(WallClock(), reported.append)
     await journal.write(*ENTRIES[:2])
-    assert await journal.refound()  # it is there
+    assert await journal.recover()  # it is there
     path.unlink()
     await journal.write(ENTRIES[2])
     await journal.write(ENTRIES[3])
     assert len(reported) == 1
     assert "was removed or renamed" in journal.lost
-    assert not await journal.refound()
+    assert not await journal.recover()
     assert (journal.lost, on_disk(tmp_path)) == ("", ENTRIES[:2])
     with pytest.raises(SessionError, match="is running this session"):
         Journal.open(tmp_path)
     await journal.write(ENTRIES[4])
-    assert await journal.refound()
+    assert await journal.recover()
     await journal.close()
     reopened, read = Journal.open(tmp_path)
     reopened.release()
@@ -308,9 +308,9 @@ async def test_a_journal_whose_folder_comes_back_goes_on_in_it(tmp_path: Path):
     folder.rename(hidden)
     await journal.write(ENTRIES[1])
     with pytest.raises(OSError, match="No such file"):
-        await journal.refound()
+        await journal.recover()
     hidden.rename(folder)
-    assert await journal.refound()
+    assert await journal.recover()
     await journal.write(ENTRIES[2])
     await journal.close()
     assert (len(reported), journal.lost, on_disk(folder)) == (1, "", ENTRIES[:3])
@@ -330,7 +330,7 @@ async def test_what_is_noted_of_a_journal_that_is_closed_or_was_given_up_is_noth
         if ended is not None:
             await ended
         journal.note(ENTRIES[2])
-        assert await journal.refound()
+        assert await journal.recover()
         reopened, read = Journal.open(folder)  # nobody has it any more
         reopened.release()
         assert read == [ENTRIES[1]]
@@ -340,12 +340,12 @@ def test_a_journal_that_somebody_else_has_is_not_taken_over_and_nothing_stays_op
     journal = Journal.create(tmp_path)
     files = len(os.listdir("/proc/self/fd"))
     with pytest.raises(BlockingIOError):
-        taken_over(tmp_path / JOURNAL_NAME, 0)
+        take_over(tmp_path / JOURNAL_NAME, 0)
     with pytest.raises(SessionError, match="is running this session"):
         Journal.open(tmp_path)
     assert len(os.listdir("/proc/self/fd")) == files
     journal.release()
-    file = taken_over(tmp_path / JOURNAL_NAME, 0)
+    file = take_over(tmp_path / JOURNAL_NAME, 0)
     file.append(b"a line\n")
     file.close()
     file.close()

@@ -11,7 +11,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app as compensate
-from thermostand.foundation.usage import Lazy, lazy_app
+from thermostand.foundation.usage import LazyCommand, make_lazy_app
 from thermostand.stand.commands.command_table import app as stand
 
 APPS = {"stand": stand, "compensate": compensate}
@@ -36,7 +36,7 @@ def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
     (tmp_path / "slow.py").write_text(
         "import signal\nprint('importing', flush=True)\nwhile True:\n    signal.pause()\n"
     )
-    code = "from thermostand.foundation.usage import *; lazy_app('x', {'go': Lazy('slow', 'go')})(['go'])"
+    code = "from thermostand.foundation.usage import *; make_lazy_app('x', {'go': Lazy('slow', 'go')})(['go'])"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
@@ -50,7 +50,7 @@ def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
 
 
 def test_an_unknown_command_is_reported_with_the_nearest_one():
-    app = lazy_app("x", {"go": Lazy("nowhere", "go")})
+    app = make_lazy_app("x", {"go": LazyCommand("nowhere", "go")})
     result = CliRunner().invoke(app, ["goo"])
     assert (result.exit_code, "Did you mean 'go'?" in result.stderr) == (2, True)
 
@@ -67,5 +67,5 @@ def test_a_command_computes_with_one_thread_unless_the_environment_says_otherwis
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", reported or "")  # pytest puts back what was there
     if reported is None:
         monkeypatch.delenv("OPENBLAS_NUM_THREADS")
-    result = CliRunner().invoke(lazy_app("x", {"go": Lazy(f"shows_{used}", "go")}), ["go"])
+    result = CliRunner().invoke(make_lazy_app("x", {"go": LazyCommand(f"shows_{used}", "go")}), ["go"])
     assert result.output == f"threads: {used}\n"

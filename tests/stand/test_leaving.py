@@ -14,7 +14,7 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.foundation.patience import BUDGET_S, LEAST_S, Patience
+from thermostand.foundation.shutdown_deadline import BUDGET_S, LEAST_S, ShutdownDeadline
 from thermostand.recording.writing.disk import FILES_LINE, QUEUE_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.chamber.compressor import CompressorFile, CompressorState
@@ -22,10 +22,10 @@ from thermostand.stand.running.memory.entries import Begun, Ended
 from thermostand.stand.running.memory.journal import Journal, Logbook
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import STOPPED, Interrupted, Stop
-from thermostand.stand.service.daemon_file import KeptCounters, KeptFile
+from thermostand.stand.service.counters import CountersFile, StoredCounters
 from thermostand.stand.service.queue import append
 from thermostand.stand.service.queue_file import QueueEntry
-from thermostand.stand.service.queue_work import RunNotes, drain
+from thermostand.stand.service.queue_worker import RunNotes, drain
 
 INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", stop_frames_below_bytes=0, alert_below_fraction=0.0)
@@ -70,12 +70,12 @@ def took_s(work: Callable[[Callable[[], None]], Coroutine[Any, Any, None]]) -> f
 def test_waits_one_after_the_other_end_with_their_budget():
     async def leave(hung: Callable[[], None]) -> None:
         hung()
-        patience, never = Patience(3.0), asyncio.get_running_loop().create_future()
+        patience, never = ShutdownDeadline(3.0), asyncio.get_running_loop().create_future()
         patience.begin()
         for _ in range(5):
             assert not await patience.wait(never, 2.0)
         patience.begin()  # begins once
-        assert patience.left_s(9.0) == LEAST_S
+        assert patience.limit_s(9.0) == LEAST_S
 
     assert took_s(leave) == pytest.approx(3.0 + 3 * LEAST_S)  # 2 s, 1 s, and the least of three more
 
@@ -84,7 +84,7 @@ def test_a_wait_under_way_ends_with_a_budget_that_begins_later():
     async def leave(hung: Callable[[], None]) -> None:
         hung()
         loop = asyncio.get_running_loop()
-        patience, never = Patience(3.0), loop.create_future()
+        patience, never = ShutdownDeadline(3.0), loop.create_future()
         assert not await patience.wait(never, 1.0)  # no budget yet: its own limit
         loop.call_later(10.0, patience.begin)
         assert not await patience.wait(never, 60.0)
@@ -95,7 +95,7 @@ def test_a_wait_under_way_ends_with_a_budget_that_begins_later():
 def test_what_has_ended_is_not_waited_for():
     async def leave(hung: Callable[[], None]) -> None:
         hung()
-        patience, work = Patience(), asyncio.get_running_loop().create_future()
+        patience, work = ShutdownDeadline(), asyncio.get_running_loop().create_future()
         work.set_result(None)
         assert await patience.wait(work, 0.0)
         assert await patience.wait(asyncio.ensure_future(asyncio.sleep(0.5)), 9.0)
@@ -117,9 +117,9 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
         queue, reported = DiskCalls(own, QUEUE_LINE, clock), []
         entry = QueueEntry(id=1, recipe="r", config="c", config_text="", recipe_text="", target_text="", added_ns=1)
         await queue.call(append, tmp_path, entry)
-        kept = KeptFile(tmp_path, own.line(FILES_LINE).run, hub, clock)
+        kept = CountersFile(tmp_path, own.line(FILES_LINE).run, hub, clock)
         compressor = CompressorFile(tmp_path / "compressor.json", hub, clock)
-        compressor.through(own.line(FILES_LINE).run)
+        compressor.delegate_to(own.line(FILES_LINE).run)
 
         async def run_one(_: QueueEntry, __: RunNotes) -> Path:
             for each in (disk, own):
@@ -130,20 +130,20 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
             stop.reason = STOPPED
             stop.ended()
             with pytest.raises(SessionError, match="not in the journal"):
-                await log.end(Ended(0, "stopped", "stopped"), stop.patience)
+                await log.end(Ended(0, "stopped", "stopped"), stop.shutdown_deadline)
             recording.cancel()
             with pytest.raises(SessionError, match="disk has not answered"):
-                await recorder.finish(FINISH_WITHIN_S, stop.patience)
-            assert not await disk.ended_within(stop.patience)
+                await recorder.finish(FINISH_WITHIN_S, stop.shutdown_deadline)
+            assert not await disk.end_within(stop.shutdown_deadline)
             raise Interrupted("the daemon was ended")
 
         try:
             with pytest.raises(Interrupted):
-                await drain(tmp_path, run_one, clock, reported.append, queue, stop.patience)
-            kept.note(KeptCounters())
-            await kept.close(stop.patience)
-            await compressor.close(stop.patience)
-            assert not await own.ended_within(stop.patience)
+                await drain(tmp_path, run_one, clock, reported.append, queue, stop.shutdown_deadline)
+            kept.note(StoredCounters())
+            await kept.close(stop.shutdown_deadline)
+            await compressor.close(stop.shutdown_deadline)
+            assert not await own.end_within(stop.shutdown_deadline)
         finally:
             for each in (disk, own):
                 os.kill(each.pid, signal.SIGKILL)

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask
-from tests.stand.a_desk import ADesk, served
+from tests.daemon_queries import ask
+from tests.stand.fake_service import FakeService, serve_fake
 from tests.stand.test_interface_access import free_port
-from thermostand.stand.serving.api.listening import MOST_CLIENTS
-from thermostand.stand.serving.client import server_at, server_of
-from thermostand.stand.serving.presence import address_in, living, opened_folder
+from thermostand.stand.serving.api.http_clients import MOST_CLIENTS
+from thermostand.stand.serving.client import find_session_server, make_server
+from thermostand.stand.serving.instances import list_daemons, make_socket_address, open_folder
 
 STATE = b"GET /api/v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
 LOOKS, PERIOD_S = 60, 0.02
@@ -24,11 +24,11 @@ LOOKS, PERIOD_S = 60, 0.02
 
 def connected(session: Path) -> socket.socket:
     """A client that has not said anything yet."""
-    (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    (daemon,) = [each for each in list_daemons() if each.entry.session == str(session)]
     client = socket.socket(socket.AF_UNIX)
     try:
-        with opened_folder(daemon.socket.parent) as folder:
-            client.connect(address_in(folder, daemon.socket.name))
+        with open_folder(daemon.socket.parent) as folder:
+            client.connect(make_socket_address(folder, daemon.socket.name))
     except OSError:
         client.close()
         raise
@@ -58,7 +58,7 @@ threading.Event().wait()
 @contextlib.contextmanager
 def flood(session: Path, count: int, request: bytes = STATE) -> Iterator[None]:
     """Clients of another process that ask as fast as they are answered, and come back when they are shut out."""
-    (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    (daemon,) = [each for each in list_daemons() if each.entry.session == str(session)]
     text = request.decode().encode("unicode_escape").decode()
     process = subprocess.Popen([sys.executable, "-c", FLOOD, str(daemon.socket), text, str(count)])
     try:
@@ -93,7 +93,7 @@ print(sorted(late_s)[len(late_s) // 2])
 async def test_a_flood_of_clients_makes_neither_the_control_loop_late_nor_shuts_out_a_stop(tmp_path: Path):
     """What the control loop is late is the median, and compared with that of a process which has nothing to do with it:
     it takes turns with two threads more, each of which may wait for a processor."""
-    async with served(ADesk(), tmp_path) as desk:
+    async with serve_fake(FakeService(), tmp_path) as desk:
         await asyncio.to_thread(ask, tmp_path, "stop")  # everything is imported
         with flood(tmp_path, 2 * MOST_CLIENTS):
             await asyncio.sleep(1.0)
@@ -102,7 +102,7 @@ async def test_a_flood_of_clients_makes_neither_the_control_loop_late_nor_shuts_
             late_s = await lateness_s()
             for _ in range(3):
                 assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
-                assert (await asyncio.to_thread(server_of(tmp_path).state)).stand == "a stand"
+                assert (await asyncio.to_thread(find_session_server(tmp_path).state)).stand == "a stand"
             another_s = float((await asyncio.to_thread(another.communicate))[0])
     assert late_s[len(late_s) // 2] < 0.01 + 4 * another_s
     assert {verb for _, verb, _ in desk.orders} == {"stop"}
@@ -110,7 +110,7 @@ async def test_a_flood_of_clients_makes_neither_the_control_loop_late_nor_shuts_
 
 async def test_a_flood_of_stops_is_one_stop_each_time(tmp_path: Path):
     stop = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n\r\n"
-    async with served(ADesk(), tmp_path) as desk:
+    async with serve_fake(FakeService(), tmp_path) as desk:
         await asyncio.to_thread(ask, tmp_path, "stop")
         began_s = time.monotonic()
         with flood(tmp_path, 8, stop):
@@ -121,7 +121,7 @@ async def test_a_flood_of_stops_is_one_stop_each_time(tmp_path: Path):
 
 @pytest.mark.parametrize("silence", [b"", b"POST /api/v1/run/st"])
 async def test_silent_clients_shut_nobody_out(tmp_path: Path, silence: bytes):
-    async with served(ADesk(), tmp_path), contextlib.AsyncExitStack() as stack:
+    async with serve_fake(FakeService(), tmp_path), contextlib.AsyncExitStack() as stack:
         for _ in range(3 * MOST_CLIENTS):
             client = stack.enter_context(await asyncio.to_thread(connected, tmp_path))
             with contextlib.suppress(BrokenPipeError):  # it had to make room already
@@ -132,24 +132,24 @@ async def test_silent_clients_shut_nobody_out(tmp_path: Path, silence: bytes):
 
 
 async def test_a_client_that_asks_and_never_reads_is_not_waited_for(tmp_path: Path):
-    async with served(ADesk(), tmp_path), contextlib.AsyncExitStack() as stack:
+    async with serve_fake(FakeService(), tmp_path), contextlib.AsyncExitStack() as stack:
         for _ in range(8):
             greedy = stack.enter_context(await asyncio.to_thread(connected, tmp_path))
             greedy.setblocking(False)
             with contextlib.suppress(BlockingIOError):
                 greedy.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200)
         assert (await asyncio.to_thread(ask, tmp_path, "stop"))["verb"] == "stop"
-        assert (await asyncio.to_thread(server_of(tmp_path).state)).stand == "a stand"
+        assert (await asyncio.to_thread(find_session_server(tmp_path).state)).stand == "a stand"
 
 
 DAEMON = """
 import asyncio, os, resource, sys
 from pathlib import Path
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.desk import Done
-from tests.stand.a_desk import ADesk, served
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.api_models import Done
+from tests.stand.fake_service import FakeService, serve_fake
 
-class Desk(ADesk):
+class Desk(FakeService):
     def stop(self, who):
         ended.set()
         return super().stop(who)
@@ -169,7 +169,7 @@ async def run():
     global ended
     ended = asyncio.Event()
     folder, port = Path(sys.argv[1]), int(sys.argv[2])
-    async with served(Desk(), folder, Interface(folder.parent, port=port)):
+    async with serve_fake(Desk(), folder, Interface(folder.parent, port=port)):
         print("ready", flush=True)
         await asyncio.to_thread(sys.stdin.readline)
         take_all()
@@ -207,15 +207,15 @@ def test_a_daemon_without_a_descriptor_left_still_answers(tmp_path: Path):
             assert b"no descriptor left" in answers.read()
         for _ in range(20):
             stack.enter_context(socket.create_connection(("127.0.0.1", port), 5.0))
-        assert server_at(f"http://127.0.0.1:{port}").order("pause", timeout_s=30.0)["moving"]
-        assert server_at(f"http://127.0.0.1:{port}").order("stop")["verb"] == "stop"
+        assert make_server(f"http://127.0.0.1:{port}").order("pause", timeout_s=30.0)["moving"]
+        assert make_server(f"http://127.0.0.1:{port}").order("stop")["verb"] == "stop"
         assert daemon.stdout.readline() == "ended\n"
 
 
 async def test_a_body_in_chunks_is_not_taken_apart_and_the_stop_before_it_is_done(tmp_path: Path):
     """A megabyte of one byte each: it says so and hangs up; STOP needs no body, and does what it is asked to."""
     chunks = b"1\r\nx\r\n" * 170_000
-    async with served(ADesk(), tmp_path) as desk:
+    async with serve_fake(FakeService(), tmp_path) as desk:
         for path, status in (("run/stop", b"200"), ("run/pause", b"411")):
             head = f"POST /api/v1/{path} HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n".encode()
             with await asyncio.to_thread(connected, tmp_path) as client:

@@ -6,12 +6,12 @@ import time
 import numpy as np
 import pytest
 
-from tests.recording.recorded import START_NS, half_second, record
+from tests.recording.full_session import START_NS, make_half_second, record
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.serving.live_history import MOST_CHANNELS, MOST_MARKS, History
-from thermostand.stand.serving.recorded_history import recorded_week, session_columns
+from thermostand.stand.serving.recorded_history import read_recorded_week, read_session_columns
 
 DAY_S = 24 * 3600
 T0 = 1_767_290_400 * NS_PER_S  # a whole number of cells
@@ -178,7 +178,7 @@ def test_no_reading_at_all_and_a_century_are_answered():
 
 async def test_a_recorded_session_gives_its_curves_and_marks_again(tmp_path):
     published = await record(tmp_path / "night", 12)
-    found = session_columns(tmp_path / "night", 1000)
+    found = read_session_columns(tmp_path / "night", 1000)
     airs = [item for item in published if isinstance(item, Batch) and item.device == "regulator"]
     assert np.nanmin(found.low["regulator.pv"]) == min(batch.readings[0].value for batch in airs)
     assert np.nanmax(found.high["regulator.pv"]) == max(batch.readings[0].value for batch in airs)
@@ -190,10 +190,10 @@ async def test_a_recorded_session_gives_its_curves_and_marks_again(tmp_path):
 
 
 async def test_after_a_restart_the_week_is_there_again_and_what_cannot_be_read_is_reported(tmp_path):
-    await record(tmp_path / "night", 12, half_second)
+    await record(tmp_path / "night", 12, make_half_second)
     (tmp_path / "broken" / "telemetry").mkdir(parents=True)
     (tmp_path / "broken" / "telemetry" / "0000.mcap").write_bytes(b"nothing")
-    history, troubles = recorded_week(tmp_path, START_NS + 3600 * NS_PER_S)
+    history, troubles = read_recorded_week(tmp_path, START_NS + 3600 * NS_PER_S)
     found = history.columns(START_NS - NS_PER_S, START_NS + 10 * NS_PER_S, 100)
     assert np.nanmax(found.high["regulator.pv"]) == 32.0
     assert len(troubles) == 1
@@ -219,7 +219,7 @@ def test_a_history_of_before_is_put_under_the_present_one():
             history.add("a.b" if index % 2 else "c.d", T0 + index * 10 * NS_PER_S, float(index * 31 % 101), "degC")
     before(Event(T0, "error", "tripped", "first"))
     now(Event(T0 + NS_PER_S, "error", "tripped", "second"))
-    now.absorb(before)
+    now.merge(before)
     for points in (100, 2000):
         found, expected = (each.columns(T0, T0 + 50_000 * NS_PER_S, points) for each in (now, both))
         for channel in ("a.b", "c.d"):
@@ -232,5 +232,5 @@ def test_what_is_too_old_is_not_put_under_the_present_one():
     before, now = History(), History()
     before.add("a.b", T0, 99.0, "degC")
     now.add("a.b", T0 + 8 * DAY_S * NS_PER_S, 1.0, "degC")
-    now.absorb(before)
+    now.merge(before)
     assert np.nanmax(now.columns(T0, T0 + 9 * DAY_S * NS_PER_S, 1000).high["a.b"]) == 1.0

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.instants import date_time, local_text, parse_instant, utc_text
+from thermostand.foundation.instants import format_date_time, format_local, format_utc, parse_instant
 from thermostand.recording.format.utc_offsets import UtcOffsets
 
 WINTER_NS = 1_767_290_404 * NS_PER_S  # 2026-01-01T18:00:04Z
@@ -23,11 +23,11 @@ def warsaw(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.usefixtures("warsaw")
 def test_times_are_shown_in_the_zone_of_then():
-    assert local_text(WINTER_NS) == "2026-01-01 19:00:04 CET"
-    assert local_text(SUMMER_NS) == "2026-07-01 20:00:04 CEST"
-    assert date_time(SUMMER_NS) == "2026-07-01 20:00:04"
+    assert format_local(WINTER_NS) == "2026-01-01 19:00:04 CET"
+    assert format_local(SUMMER_NS) == "2026-07-01 20:00:04 CEST"
+    assert format_date_time(SUMMER_NS) == "2026-07-01 20:00:04"
     assert UtcOffsets(3600 * NS_PER_S).local_text(WINTER_NS) == "2026-01-01 20:00:04 CET"
-    assert utc_text(WINTER_NS).startswith("2026-01-01T18:00:04.")
+    assert format_utc(WINTER_NS).startswith("2026-01-01T18:00:04.")
 
 
 @pytest.mark.usefixtures("warsaw")
@@ -40,4 +40,4 @@ def test_a_time_without_a_zone_is_local():
 @pytest.mark.usefixtures("warsaw")
 @pytest.mark.parametrize("time_ns", [-(1 << 63), 0, (1 << 63) - 1])
 def test_every_instant_of_a_recording_can_be_shown(time_ns: int):
-    assert len(local_text(time_ns).split()) == 3
+    assert len(format_local(time_ns).split()) == 3

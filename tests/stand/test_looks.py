@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
@@ -16,11 +16,11 @@ from thermostand.stand.config.chamber_section import (
     SteadyStatePowerConfig,
 )
 from thermostand.stand.fault import Rule
-from thermostand.stand.guarding.heat_balance import heat_not_felt, too_much_heat
-from thermostand.stand.guarding.startup_response import first_heat
-from thermostand.stand.guarding.steady_state_power import output_not_as_needed
-from thermostand.stand.guarding.stuck_sensor import frozen
-from thermostand.stand.guarding.thermal_crosscheck import camera_feels, granite_feels
+from thermostand.stand.guarding.heat_balance import limit_heat_energy, require_heat_response
+from thermostand.stand.guarding.startup_response import require_startup_response
+from thermostand.stand.guarding.steady_state_power import limit_output_deviation
+from thermostand.stand.guarding.stuck_sensor import forbid_stuck_sensor
+from thermostand.stand.guarding.thermal_crosscheck import crosscheck_by_camera, crosscheck_by_granite
 
 POLL_S = 5
 PV, AIR, GRANITE, CAMERA = "regulator.pv", "thermometers.air", "thermometers.granite_inside", "camera.temperature"
@@ -63,7 +63,7 @@ class Feed:
         for since_s in range(0, duration_s, POLL_S):
             self.time_s = begun_s + since_s
             values = AT_REST | {name.replace("_", ".", 1): value(since_s) for name, value in changing.items()}
-            time_ns = seconds_ns(self.time_s)
+            time_ns = to_ns(self.time_s)
             readings = tuple(
                 bad_reading(channel, "1", time_ns, "off")
                 if math.isnan(value)
@@ -82,7 +82,7 @@ def constant(value: float) -> Callable[[float], float]:
 
 
 def test_granite_that_warms_tells_of_air_that_no_probe_shows():
-    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
+    feed = Feed(crosscheck_by_granite(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
     assert feed.run(1200, thermometers_granite_inside=lambda s: 40 + noise_K(s)) is None
     warmed_s = feed.run(600, thermometers_granite_inside=lambda s: 40 + noise_K(s) + 8 * s / GRANITE_LAG_S)  # air of 48
     assert warmed_s is not None
@@ -90,12 +90,12 @@ def test_granite_that_warms_tells_of_air_that_no_probe_shows():
 
 
 def test_one_wild_value_of_the_granite_is_no_warming():
-    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
+    feed = Feed(crosscheck_by_granite(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
     assert feed.run(600, thermometers_granite_inside=lambda s: 40 + noise_K(s) + 30 * (s == 300)) is None
 
 
 def test_granite_in_a_ramp_is_forgiven_a_lag_that_is_a_third_off():
-    feed = Feed(granite_feels(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
+    feed = Feed(crosscheck_by_granite(GRANITE_LIMITS, GRANITE_LAG_S, GRANITE, PV))
     true_lag_s, ramp_K_s = 0.7 * GRANITE_LAG_S, 0.05
 
     def granite(s: float) -> float:
@@ -105,7 +105,7 @@ def test_granite_in_a_ramp_is_forgiven_a_lag_that_is_a_third_off():
 
 
 def test_a_camera_that_warms_tells_when_its_own_excess_is_known():
-    feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
+    feed = Feed(crosscheck_by_camera(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
     assert feed.run(1000, camera_temperature=lambda s: 60 - 20 * math.exp(-s / 300)) is None  # it warms itself up
     assert feed.run(1500) is None
     warmed_s = feed.run(900, camera_temperature=lambda s: 0.25 * round(4 * (60 + 15 * (1 - math.exp(-s / 600)))))
@@ -114,7 +114,7 @@ def test_a_camera_that_warms_tells_when_its_own_excess_is_known():
 
 
 def test_a_camera_that_was_off_is_learned_again_and_one_that_does_not_move_is_not_believed():
-    feed = Feed(camera_feels(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
+    feed = Feed(crosscheck_by_camera(CAMERA_LIMITS, CAMERA_LAG_S, CAMERA, AIR))
     assert feed.run(2500) is None
     assert feed.run(120, camera_temperature=constant(math.nan)) is None
     assert feed.run(2500, camera_temperature=constant(75.0)) is None
@@ -122,7 +122,7 @@ def test_a_camera_that_was_off_is_learned_again_and_one_that_does_not_move_is_no
 
 
 def test_more_heat_within_an_hour_than_the_chamber_ever_needs():
-    rule = too_much_heat(1400, 2000, "regulator", PERMIT)
+    rule = limit_heat_energy(1400, 2000, "regulator", PERMIT)
     feed = Feed(rule)
     assert feed.run(7200, regulator_mv_heat=constant(65.0)) is None
     assert feed.run(7200, regulator_mv_heat=constant(100.0), relays_heater_enable=constant(0.0)) is None
@@ -133,7 +133,7 @@ def test_more_heat_within_an_hour_than_the_chamber_ever_needs():
 
 def test_a_probe_that_falls_or_stays_while_the_regulator_heats():
     def heated(pv: Callable[[float], float], set_point_degC: float = 60.0) -> int | None:
-        feed = Feed(heat_not_felt(HEAT, CHAMBER, PV, "regulator", PERMIT))
+        feed = Feed(require_heat_response(HEAT, CHAMBER, PV, "regulator", PERMIT))
         assert feed.run(300) is None
         return feed.run(600, regulator_pv=pv, regulator_sp=constant(set_point_degC), regulator_mv_heat=constant(100.0))
 
@@ -145,7 +145,7 @@ def test_a_probe_that_falls_or_stays_while_the_regulator_heats():
 
 
 def test_an_output_far_from_what_was_needed():
-    feed = Feed(output_not_as_needed(NEEDED, "regulator", PERMIT, COMPRESSOR, FLAP))
+    feed = Feed(limit_output_deviation(NEEDED, "regulator", PERMIT, COMPRESSOR, FLAP))
     assert feed.run(2400) is None
     assert feed.run(3600, regulator_mv_heat=constant(45.0), relays_compressor=constant(1.0)) is None  # learned apart
     assert feed.run(3600, regulator_mv_heat=constant(60.0), regulator_sp=constant(60.0)) is None  # in a ramp
@@ -157,7 +157,7 @@ def test_an_output_far_from_what_was_needed():
 
 def test_a_fine_thermometer_without_noise_is_frozen_only_while_the_output_works():
     def rule() -> Rule:
-        return frozen(AIR, (AIR, GRANITE), "regulator")
+        return forbid_stuck_sensor(AIR, (AIR, GRANITE), "regulator")
 
     def noisy(step_K: float) -> Callable[[float], float]:
         return lambda s: 40 + step_K * ((s // POLL_S) % 3)
@@ -171,7 +171,7 @@ def test_a_fine_thermometer_without_noise_is_frozen_only_while_the_output_works(
 
 def test_the_first_heat_must_reach_both_probes():
     def heated(pv_K: float, air_K: float) -> int | None:
-        feed = Feed(first_heat(FIRST, AIR, "regulator", PERMIT))
+        feed = Feed(require_startup_response(FIRST, AIR, "regulator", PERMIT))
         assert feed.run(300) is None
         return feed.run(
             600,
@@ -187,7 +187,7 @@ def test_the_first_heat_must_reach_both_probes():
 
 
 def test_after_the_first_heat_nothing_more_is_asked():
-    feed = Feed(first_heat(FIRST, AIR, "regulator", PERMIT))
+    feed = Feed(require_startup_response(FIRST, AIR, "regulator", PERMIT))
 
     def rising(since_s: float) -> float:
         return 40 + since_s / 50

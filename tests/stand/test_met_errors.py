@@ -15,7 +15,7 @@ from thermostand.foundation.errors import (
 )
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.stand.guarding.met_errors import MetErrors
+from thermostand.stand.guarding.step_errors import StepErrors
 
 KINDS = {"flap": "flap", "linear": "axis", "regulator": "regulator", "relays": "relays", "camera": "camera"}
 TABLE = [
@@ -37,8 +37,8 @@ TABLE = [
 
 
 def bench_of(*actions: str) -> Bench:
-    bench, met = Bench(*actions), MetErrors(KINDS)
-    bench.guard.met = met
+    bench, met = Bench(*actions), StepErrors(KINDS)
+    bench.guard.step_errors = met
     bench.guard.watches = (*bench.guard.watches, *met.watches)
     bench.hub.subscribe(met)
     return bench
@@ -54,7 +54,7 @@ async def test_each_error_holds_at_once_by_its_rule_and_ends_as_that_does(
     error: DeviceError, rule: str, ends_itself: bool
 ):
     bench = bench_of("hold")
-    bench.guard.meet(error)
+    bench.guard.handle_step_error(error)
     assert bench.guard.held is not None
     assert (bench.guard.held.rule, bench.guard.held.action, bench.guard.held.ends_itself) == (rule, "hold", ends_itself)
     await bench.run_for(3)
@@ -71,7 +71,7 @@ async def test_each_error_holds_at_once_by_its_rule_and_ends_as_that_does(
 
 async def test_what_does_not_answer_yet_holds_again_at_once_when_it_is_cleared():
     bench = bench_of("hold")
-    bench.guard.meet(Unreachable("flap", "gone"))
+    bench.guard.handle_step_error(Unreachable("flap", "gone"))
     bench.clear()
     assert bench.log == ["hold device_lost", "revoke", "hold device_lost", "revoke"]
 
@@ -79,7 +79,7 @@ async def test_what_does_not_answer_yet_holds_again_at_once_when_it_is_cleared()
 async def test_a_device_that_is_lost_again_and_again_needs_an_operator():
     bench = bench_of("hold")
     for times in range(4):
-        bench.guard.meet(Unreachable("flap", "gone"))
+        bench.guard.handle_step_error(Unreachable("flap", "gone"))
         read(bench, "flap")
         await bench.run_for(3)
         assert (bench.guard.held is not None) is (times == 3)
@@ -89,7 +89,7 @@ async def test_a_device_that_is_lost_again_and_again_needs_an_operator():
 
 async def test_what_the_guards_table_aborts_for_aborts_also_in_the_hold_of_a_step():
     bench = bench_of("abort")
-    bench.guard.meet(Unreachable("regulator", "silent"))
+    bench.guard.handle_step_error(Unreachable("regulator", "silent"))
     await bench.run_for(2)
     bench.objecting = {0}
     assert not await bench.run_for(2)

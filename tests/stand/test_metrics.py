@@ -5,17 +5,17 @@ import json
 import re
 from pathlib import Path
 
-from tests.stand.a_desk import ADesk
+from tests.stand.fake_service import FakeService
 from tests.stand.test_interface import STATUS
 from thermostand.stand.serving.api.bridge import Bridge, StateSnapshot
-from thermostand.stand.serving.api.reads import metrics
-from thermostand.stand.serving.desk import FaultState, HeatByHand, QueuedRun
+from thermostand.stand.serving.api.read_routes import format_metrics
+from thermostand.stand.serving.api_models import FaultState, HeatByHand, QueuedRun
 
 _SAMPLE = re.compile(r'(thermostand_[a-z_]+)(\{([a-z_]+="(\\.|[^"\\\n])*",?)*\})? (-?[0-9.e+-]+)')
 
 
 async def page() -> str:
-    desk = ADesk("operator", run=STATUS.model_copy(update={"end_ns": STATUS.now_ns + 60_000_000_000}))
+    desk = FakeService("operator", run=STATUS.model_copy(update={"end_ns": STATUS.now_ns + 60_000_000_000}))
     bridge = Bridge(desk)
     state = bridge.snapshot.state.model_copy(
         update={
@@ -29,7 +29,7 @@ async def page() -> str:
         }
     )
     bridge.close()
-    return metrics(StateSnapshot(state, bridge.snapshot.at_s), 3, 2)
+    return format_metrics(StateSnapshot(state, bridge.snapshot.at_s), 3, 2)
 
 
 async def test_every_line_is_of_the_format_and_no_measurement_is_invented():

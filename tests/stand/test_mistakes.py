@@ -10,12 +10,12 @@ from thermostand.foundation.documents import load_document, parse_document
 from thermostand.foundation.errors import ConfigError, SessionError, StandError
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.memory.journal import Journal
 from thermostand.stand.running.order import load_order
 
-STAND = packaged("", "laboratory").read_text(encoding="utf-8")
-RECIPE = packaged("recipes", "trial").read_text(encoding="utf-8")
+STAND = find_packaged("", "laboratory").read_text(encoding="utf-8")
+RECIPE = find_packaged("recipes", "trial").read_text(encoding="utf-8")
 
 
 def said(call: Callable[[], object], error: type[StandError] = ConfigError) -> str:
@@ -49,7 +49,7 @@ def test_files_that_were_exchanged(tmp_path: Path):
     assert exchanged.startswith("mine.yaml: is a recipe")
     assert exchanged.endswith("`stand run RECIPE --config STAND`")
     assert said(lambda: parse_document(STAND, Recipe, "mine.yaml")).startswith("mine.yaml: is a stand")
-    said_so = said(lambda: packaged("", str(tmp_path)))
+    said_so = said(lambda: find_packaged("", str(tmp_path)))
     assert said_so.startswith(f"{tmp_path}: is a folder")
     assert "installed: laboratory" in said_so
 

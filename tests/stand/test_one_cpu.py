@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from thermostand.stand.service import run
-from thermostand.stand.service.run import one_cpu
+from thermostand.stand.service.run import pin_to_one_cpu
 
 CPUS = "import os; print(sorted(os.sched_getaffinity(0)))"
 
@@ -20,7 +20,7 @@ CPUS = "import os; print(sorted(os.sched_getaffinity(0)))"
 def test_what_is_started_inside_shares_the_cpu_and_afterwards_all_are_usable_again():
     usable = os.sched_getaffinity(0)
     of_thread: list[set[int]] = []
-    with one_cpu():
+    with pin_to_one_cpu():
         (cpu,) = os.sched_getaffinity(0)
         assert cpu in usable
         assert subprocess.run([sys.executable, "-c", CPUS], capture_output=True, text=True).stdout == f"[{cpu}]\n"
@@ -35,7 +35,7 @@ def test_a_thread_that_was_there_before_and_one_that_stays_behind_follow():
     usable = os.sched_getaffinity(0)
     with ThreadPoolExecutor(1) as before, ThreadPoolExecutor(1) as within:
         assert before.submit(os.sched_getaffinity, 0).result() == usable
-        with one_cpu():
+        with pin_to_one_cpu():
             assert len(before.submit(os.sched_getaffinity, 0).result()) == 1
             assert len(within.submit(os.sched_getaffinity, 0).result()) == 1
         assert before.submit(os.sched_getaffinity, 0).result() == usable
@@ -44,14 +44,14 @@ def test_a_thread_that_was_there_before_and_one_that_stays_behind_follow():
 
 def test_the_cpus_are_given_back_also_after_an_error():
     usable = os.sched_getaffinity(0)
-    with pytest.raises(ValueError, match="half-way"), one_cpu():
+    with pytest.raises(ValueError, match="half-way"), pin_to_one_cpu():
         raise ValueError("half-way")
     assert os.sched_getaffinity(0) == usable
 
 
 def hold(folder: Path, told: Connection) -> None:
     run._CPU_FOLDER = str(folder / "cpu{}")  # type: ignore[reportPrivateUsage]  # others may take the machine's now
-    with one_cpu():
+    with pin_to_one_cpu():
         told.send(os.sched_getaffinity(0))
         threading.Event().wait()
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from typer.testing import CliRunner, Result
 
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from tests.stand.test_interface_access import book, free_port
 from thermostand.stand.commands.command_table import app as stand
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 
 TOKEN = "correct-horse-battery-staple"
 
@@ -21,7 +21,7 @@ async def invoke(*arguments: object) -> Result:
 async def test_a_run_is_submitted_once_for_each_key(tmp_path: Path):
     recipe = tmp_path / "night.yaml"
     recipe.write_text("name: night\n")
-    async with served(ADesk(), tmp_path / "sessions") as desk:
+    async with serve_fake(FakeService(), tmp_path / "sessions") as desk:
         there = (tmp_path / "sessions",)
         assert (await invoke("submit", recipe, *there, "--key", "monday")).stdout == "1\n"
         assert (await invoke("submit", recipe, *there, "--key", "monday")).stdout == "1\n"
@@ -35,7 +35,7 @@ async def test_a_run_is_begun_at_an_address_and_what_is_of_this_machine_is_refus
     port, token = free_port(), tmp_path / "token"
     token.write_text(TOKEN)
     there = ["--url", f"http://127.0.0.1:{port}", "--token-file", str(token), "--detach"]
-    async with served(ADesk(), tmp_path / "sessions", Interface(tmp_path, port=port, tokens=book())) as desk:
+    async with serve_fake(FakeService(), tmp_path / "sessions", Interface(tmp_path, port=port, tokens=book())) as desk:
         begun = await asyncio.to_thread(CliRunner().invoke, stand, ["run", "demo", *there])
         assert begun.stdout == "run 1 is queued; `stand status` follows it\n"
         refused = await asyncio.to_thread(CliRunner().invoke, stand, ["run", "demo", *there, "--seed", "0"])
@@ -47,7 +47,7 @@ async def test_a_device_is_commanded_over_the_network(tmp_path: Path):
     port, token = free_port(), tmp_path / "token"
     token.write_text(TOKEN)
     interface = Interface(tmp_path, port=port, tokens=book())
-    async with served(ADesk(), tmp_path / "sessions", interface) as desk:
+    async with serve_fake(FakeService(), tmp_path / "sessions", interface) as desk:
         there = ("--url", f"http://127.0.0.1:{port}", "--token-file", token)
         assert (await invoke("device", *there)).stdout == "flap (flap)\n"
         assert (await invoke("device", "flap", "move", "to=0.5", "how=gently", *there)).stdout == "flap: move\n"

@@ -8,14 +8,14 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from axe_playwright_python.base import AXE_SCRIPT
 
-from tests.recording.recorded import record
+from tests.recording.full_session import record
 from tests.stand.browser import PHONE, VIEWS, a_page, needs_chromium
-from tests.stand.page_desk import a_night, frame_of, free_port, target_image
+from tests.stand.page_service import frame_of, free_port, serve_cycle, target_image
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Reading
 from thermostand.stand.gate import CAMERA_LOST
-from thermostand.stand.serving.desk import HeatByHand, NotConfirmed
+from thermostand.stand.serving.api_models import HeatByHand, NotConfirmed
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 
@@ -233,7 +233,7 @@ async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
 
 async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path, chromium):
     port = free_port()
-    async with a_night(tmp_path / "sessions", port) as first:
+    async with serve_cycle(tmp_path / "sessions", port) as first:
         manager = a_page(chromium, port)
         page = await manager.__aenter__()
         await page.get_by_text("Running", exact=True).wait_for()
@@ -241,7 +241,7 @@ async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path
     await page.locator("#phase", has_text="No connection").wait_for()
     await page.get_by_text("What is shown is of").wait_for()
     await page.get_by_role("link", name="Queue").click()  # whose recipes nobody gives now
-    async with a_night(tmp_path / "sessions", port) as second:
+    async with serve_cycle(tmp_path / "sessions", port) as second:
         await page.locator("#phase", has_text="Running").wait_for()
         await page.get_by_text("No connection to the stand").wait_for(state="detached")
         await page.locator("#recipe option").first.wait_for(state="attached")

@@ -10,9 +10,9 @@ import pytest
 from tests.stand.browser import DESKTOP, PHONE, VIEWS, a_page, needs_chromium
 from thermostand.foundation.documents import parse_document
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.gate import NOT_RECORDED, OPERATOR
-from thermostand.stand.serving.desk import NotConfirmed, QueuedRun
+from thermostand.stand.serving.api_models import NotConfirmed, QueuedRun
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]
 
@@ -146,7 +146,7 @@ async def test_the_plan_is_a_time_line_whose_steps_are_left_out_and_extended(nig
     async with a_page(night.chromium, night.port, "plan") as page:
         under_way = page.locator(".steps li[data-standing='under_way']")
         await under_way.wait_for()
-        assert "earned" in await under_way.inner_text()
+        assert "soaked" in await under_way.inner_text()
         await page.get_by_role("button", name="+15 min: step 32").click()
         await until(lambda: night.orders)
         assert night.orders[-1][2]["by_s"] == 900
@@ -237,7 +237,7 @@ async def test_steps_and_parts_within_parts_have_fields_of_their_own(night):
         assert reported["steps"][-1]["soak"]["duration_s"] == 90
         repeat = next(step["repeat"] for step in reported["steps"] if "repeat" in step)
         assert repeat["steps"][0]["ramp"]["rate_K_per_min"] == 0.7
-        before = len(list(parse_document(packaged("recipes", "ramps").read_text(), Recipe, "ramps").plan()))
+        before = len(list(parse_document(find_packaged("recipes", "ramps").read_text(), Recipe, "ramps").plan()))
         assert len(list(parse_document(json.dumps(reported), Recipe, "sent").plan())) == before + 1
 
 

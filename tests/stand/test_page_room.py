@@ -12,11 +12,11 @@ from contextlib import asynccontextmanager
 import pytest
 import pytest_asyncio
 
-from tests.recording.recorded import half_second, record
-from tests.stand.page_desk import TARGET, a_night, frame_of, free_port, target_image
+from tests.recording.full_session import make_half_second, record
+from tests.stand.page_service import TARGET, frame_of, free_port, serve_cycle, target_image
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
-from thermostand.stand.gate import IN_WORDS
-from thermostand.stand.serving.page_room import PAGE
+from thermostand.stand.gate import REASON_TEXTS
+from thermostand.stand.serving.page_routes import PAGE
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 @asynccontextmanager
 async def served_night(folder):
     port = free_port()
-    async with a_night(folder, port) as desk:
+    async with serve_cycle(folder, port) as desk:
         desk.port, desk.folder = port, folder
         yield desk
 
@@ -83,7 +83,7 @@ async def test_the_dark_changes_colours_only():
 
 async def test_each_reason_to_hold_has_its_words():
     text = (PAGE / "notices.js").read_text("utf-8")
-    assert [reason for reason in IN_WORDS if f"{reason}: " not in text] == []
+    assert [reason for reason in REASON_TEXTS if f"{reason}: " not in text] == []
 
 
 @pytest.mark.parametrize("name", ["../page_room.py", "..%2Fpage_room.py", "%2e%2e%2fdesk.py", "nothing.js", ".", "%00"])
@@ -157,7 +157,7 @@ async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
     """Eight frames to fit after a reference; the target moves by 0.2 px a frame."""
 
     def items(time_ns, index):
-        yield from (item for item in half_second(time_ns, index) if isinstance(item, Batch))
+        yield from (item for item in make_half_second(time_ns, index) if isinstance(item, Batch))
         parameters = {"frames": 1, "interval_s": 0.5, "role": "reference" if not index else "fit"}
         yield StepMark(time_ns, f"c{index}", index, "capture", StepState.STARTED, parameters)
         yield frame_of(target_image(0, 0.2 * index, (612, 512)), time_ns, f"c{index}")

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
-from thermostand.foundation.tasks import cancelled
+from thermostand.foundation.tasks import cancel_all
 from thermostand.stand.chamber.compressor import CompressorState
-from thermostand.stand.chamber.keeper import Keeper
+from thermostand.stand.chamber.permit_renewer import PermitRenewer
 from thermostand.stand.chamber.permits import COMPRESSOR, HEATER, Permission, PermitLimits, Permits
 from thermostand.stand.config.stand_config import CompressorConfig
 
@@ -70,7 +70,7 @@ class Bench:
     """A compressor that has rested, unless `compressor` says something else. kept: what was to be remembered of it."""
 
     def __init__(self, compressor: CompressorState | None) -> None:
-        self.clock, hub = VirtualClock(seconds_ns(1000)), Hub()
+        self.clock, hub = VirtualClock(to_ns(1000)), Hub()
         self.board = Board(self.clock)
         self.kept: list[CompressorState] = []
         self.events: list[Event] = []
@@ -85,7 +85,7 @@ class Bench:
         return self.clock.now_ns()
 
     async def wait(self, duration_s: float) -> None:
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
 
     async def keep(self, duration_s: float, outputs: tuple[float, float] = (0.0, 0.0)) -> None:
         """Renew each 5 s, for so long."""
@@ -118,13 +118,13 @@ async def test_heat_lasts_as_long_as_it_is_renewed_and_its_timer_longer():
         assert not board.is_on(HEATER)  # nothing is permitted yet
         permits.grant()
         await bench.keep(60.0)
-        assert (board.is_on(HEATER), permits.gives, permits.timer_s, permits.ended_ns) == (True, True, HOLD_S, None)
-        renewed_ns = bench.now_ns - seconds_ns(5.0)
+        assert (board.is_on(HEATER), permits.may_heat, permits.timer_s, permits.ended_ns) == (True, True, HOLD_S, None)
+        renewed_ns = bench.now_ns - to_ns(5.0)
         await bench.wait(HOLD_S - 5.0)
         assert not board.is_on(HEATER)
         assert permits.ended_ns == bench.now_ns
         await bench.wait(60.0)
-        assert permits.ended_ns == renewed_ns + seconds_ns(HOLD_S)
+        assert permits.ended_ns == renewed_ns + to_ns(HOLD_S)
         assert await permits.arm(0.0, 0.0) == {HEATER: False, COMPRESSOR: False}
         assert (board.is_on(HEATER), permits.ended_ns) == (True, None)
         await bench.wait(60.0)
@@ -145,10 +145,10 @@ async def test_relays_without_a_timer_end_nothing():
 async def test_while_the_guard_finds_something_nothing_is_renewed():
     async with benches() as bench:
         bench.permits.grant()
-        bench.permits.allowed = lambda: False
+        bench.permits.is_allowed = lambda: False
         await bench.keep(20.0, COLD)
-        assert bench.permits.granted
-        assert not bench.permits.gives
+        assert bench.permits.is_granted
+        assert not bench.permits.may_heat
         assert not bench.board.until_ns
         assert bench.kept == []
 
@@ -189,7 +189,7 @@ async def test_the_compressor_is_remembered_before_it_runs_and_when_it_has_stopp
         assert bench.kept == [CompressorState(True, begun_ns, (begun_ns,))]
         assert bench.told() == [("compressor", True)]
         await bench.keep(5.0, WARM)
-        ended_ns = bench.now_ns - seconds_ns(5.0)
+        ended_ns = bench.now_ns - to_ns(5.0)
         assert not bench.board.is_on(COMPRESSOR)
         assert bench.board.switched == [(COMPRESSOR, False)]
         assert bench.kept[1:] == [CompressorState(False, ended_ns, (begun_ns,))]
@@ -214,7 +214,7 @@ async def test_a_start_that_is_not_confirmed_counts_and_a_relay_that_then_drops_
         assert bench.kept == [CompressorState(True, begun_ns, (begun_ns,))]
         await bench.wait(60.0)
         await bench.permits.arm(0.0, 0.0)
-        assert bench.kept[1:] == [CompressorState(False, begun_ns + seconds_ns(HOLD_S), (begun_ns,))]
+        assert bench.kept[1:] == [CompressorState(False, begun_ns + to_ns(HOLD_S), (begun_ns,))]
         assert bench.told() == []
 
 
@@ -245,7 +245,7 @@ async def test_what_others_switch_on_while_heat_is_permitted_is_off_again_and_co
         assert bench.kept == [CompressorState(False, on_ns, (on_ns,))]
         assert bench.told() == [("switched_off", COMPRESSOR)]
         assert bench.permits.intrusions == 1
-        bench.permits.forgive()
+        bench.permits.clear_intrusions()
         assert bench.permits.intrusions == 0
 
 
@@ -291,16 +291,16 @@ async def test_a_compressor_that_is_made_safe_has_stopped_and_its_relay_was_not_
 
 
 async def test_what_was_left_on_is_said_relay_by_relay_and_a_compressor_rests_from_now_on():
-    start_ns = seconds_ns(500)
+    start_ns = to_ns(500)
     async with benches(CompressorState(False, 0, (start_ns,))) as bench:
         for channel in (HEATER, COMPRESSOR):
             bench.board.others_switch(channel, True)
         await bench.wait(10.0)
-        await bench.permits.withdraw_left_on()
+        await bench.permits.switch_off_left_on()
         assert bench.told() == [("left_on", COMPRESSOR), ("left_on", HEATER)]
         assert bench.kept == [CompressorState(False, bench.now_ns, (start_ns,))]
         assert bench.permits.permission is Permission.WITHDRAWN
-        await bench.permits.withdraw_left_on()
+        await bench.permits.switch_off_left_on()
         assert (bench.told(), bench.kept[1:]) == ([], [])
 
 
@@ -320,7 +320,7 @@ async def test_a_board_that_drops_in_time_is_suited_and_its_time_is_measured_whe
             assert TEST_S <= held_s <= TEST_S + 0.06
             assert held_s == round(held_s, 2)
         assert bench.board.switched == [(HEATER, False)]
-        assert bench.now_ns - begin_ns == seconds_ns(6.5)
+        assert bench.now_ns - begin_ns == to_ns(6.5)
 
 
 @pytest.mark.parametrize(("lasts", "rearmed", "dropped"), [(True, True, False), (False, False, True)])
@@ -389,7 +389,7 @@ class Kept(Bench):
         self.seen: list[tuple[float, Mapping[str, bool]]] = []
         hub = Hub()
         hub.subscribe(lambda item: self.events.append(item) if isinstance(item, Event) else None)
-        self.keeper = Keeper(self.permits, self.regulator, hub, self.clock, 5.0, self._see)
+        self.keeper = PermitRenewer(self.permits, self.regulator, hub, self.clock, 5.0, self._see)
 
     def _see(self, coils: Mapping[str, bool]) -> None:
         self.seen.append((self.clock.now_ns() / 1e9, coils))
@@ -397,7 +397,7 @@ class Kept(Bench):
     async def run(self, duration_s: float) -> None:
         keeping = asyncio.create_task(self.keeper.run())
         await self.wait(duration_s)
-        await cancelled([keeping])
+        await cancel_all([keeping])
 
 
 @asynccontextmanager
@@ -475,5 +475,5 @@ async def test_what_keeps_permits_from_being_renewed_is_said_when_it_begins_and_
             kept.board.failure = failure
             await kept.wait(5.0)
             told.append(len(kept.told()))
-        await cancelled([keeping])
+        await cancel_all([keeping])
         assert told == [1, 0, 0, 1, 0, 1, 0, 1]

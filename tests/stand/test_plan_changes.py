@@ -25,16 +25,24 @@ from thermostand.experiments.steps import (
     SoakUntilSettled,
     StartChamber,
     StopChamber,
+    make_step,
     number_steps,
-    step_of,
 )
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.stand.gate import OPERATOR
-from thermostand.stand.running.memory.entries import Change, Edited, Extended, Skipped, StepChanged, change_of, data_of
-from thermostand.stand.running.memory.fold import fold, refusal
+from thermostand.stand.running.memory.entries import (
+    Change,
+    Edited,
+    Extended,
+    Skipped,
+    StepChanged,
+    make_change_data,
+    parse_change,
+)
+from thermostand.stand.running.memory.fold import find_refusal, fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 
 CAPTURE = Capture(4, 5.0, 0.1, Role.FIT, 24.0)
@@ -158,7 +166,7 @@ def test_the_rest_of_a_plan_is_replaced(life: Callable[..., Life]):
     assert marks(here) == [f"{step.kind} done" for step in (StartChamber(0), Soak(0), *rest)]
     (event,) = [item for item in here.reported if isinstance(item, Event) and item.kind == "plan_changed"]
     assert (event.data["from_index"], event.data["steps"], event.data["frames"]) == (2, 5, 0)
-    assert [step_of(each["kind"], each["parameters"]) for each in cast("Any", event.data["by"])] == rest
+    assert [make_step(each["kind"], each["parameters"]) for each in cast("Any", event.data["by"])] == rest
 
 
 def test_changes_hold_after_a_kill(life: Callable[..., Life]):
@@ -244,7 +252,7 @@ BEGUN = fold(PLAN, [StepChanged(0, ID[0], "started"), StepChanged(0, ID[0], "don
     ],
 )
 def test_what_cannot_be_changed_says_why_and_changes_nothing(change: Change, why: str):
-    assert refusal(BEGUN, change) == why
+    assert find_refusal(BEGUN, change) == why
     assert (
         fold(PLAN, [StepChanged(0, ID[0], "done"), StepChanged(0, ID[1], "started"), change]).changes == ()
     ) is bool(why)
@@ -256,9 +264,9 @@ def test_what_cannot_be_changed_says_why_and_changes_nothing(change: Change, why
 )
 def test_a_change_is_the_same_in_the_journal_and_in_the_recording(change: Change):
     assert read_lines(lines_with([change]))[0] == [change]
-    assert change_of(7, {**data_of(change), "frames": 3}) == change
-    assert change_of(7, {"change": "Teleported"}) is None
-    assert change_of(7, {"change": "Skipped"}) is None
+    assert parse_change(7, {**make_change_data(change), "frames": 3}) == change
+    assert parse_change(7, {"change": "Teleported"}) is None
+    assert parse_change(7, {"change": "Skipped"}) is None
 
 
 def test_a_plan_that_is_done_takes_no_more_steps(life: Callable[..., Life]):
@@ -280,7 +288,7 @@ def test_a_soak_that_waits_for_the_camera_is_longer_at_the_least_and_at_the_most
 
 @pytest.mark.parametrize("step", [*(planned.step for planned in PLAN), MoveTo("linear", 2.0), SetTemperature(20)])
 def test_a_step_is_made_again_of_its_kind_and_parameters(step: Any):
-    assert step_of(step.kind, step.parameters) == step
+    assert make_step(step.kind, step.parameters) == step
 
 
 @pytest.mark.parametrize(
@@ -299,5 +307,5 @@ def test_a_step_is_made_again_of_its_kind_and_parameters(step: Any):
 )
 def test_what_is_no_step_is_refused(kind: str, parameters: dict[str, object], why: str):
     with pytest.raises(ConfigError) as refused:
-        step_of(kind, parameters)
+        make_step(kind, parameters)
     assert why in str(refused.value)

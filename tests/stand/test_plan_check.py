@@ -7,18 +7,18 @@ from typing import Any, cast
 import pytest
 from pydantic import JsonValue
 
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.experiments.steps import Capture, OpenFlap, Soak, StartChamber, StopChamber, number_steps
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.running.course import check_edit, steps_of
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.memory.entries import StepChanged
 from thermostand.stand.running.memory.fold import fold
-from thermostand.stand.serving.client import server_of
-from thermostand.stand.serving.desk import WrittenStep
+from thermostand.stand.running.run_control import check_edit, resolve_steps
+from thermostand.stand.serving.api_models import WrittenStep
+from thermostand.stand.serving.client import find_session_server
 
 PLAN = tuple(number_steps([StartChamber(24.0), Soak(60.0), OpenFlap(), StopChamber()]))
 BEGUN = fold(PLAN, [StepChanged(0, PLAN[0].step_id, "started"), StepChanged(0, PLAN[0].step_id, "done")])
-CONFIG = load_config(packaged("", "simulated"))
+CONFIG = load_config(find_packaged("", "simulated"))
 
 
 def written(kind: str, **parameters: JsonValue) -> WrittenStep:
@@ -77,13 +77,13 @@ def test_frames_are_at_the_set_point_of_the_steps_before():
     steps = [OPEN, UNLABELLED, COLDER, labelled(FIT, chamber_degC=None), written("stop_chamber"), FIT]
     found = check_edit(BEGUN, 1, steps, CONFIG)
     assert (found.faults, found.set_points_degC) == ((), (24.0, 24.0, 24.0, 18.0, 18.0, None))
-    made = [step for step, _ in steps_of(PLAN, 1, steps)]
+    made = [step for step, _ in resolve_steps(PLAN, 1, steps)]
     assert [step.chamber_degC for step in made if isinstance(step, Capture)] == [24.0, 18.0, 24.0]
 
 
 async def test_the_interface_checks_an_edit_and_gives_the_form_of_each_step(tmp_path: Path):
-    async with served(ADesk(), tmp_path) as desk:
-        server = server_of(tmp_path)
+    async with serve_fake(FakeService(), tmp_path) as desk:
+        server = find_session_server(tmp_path)
         body = {"from_index": 0, "steps": [SOAK.model_dump(), {"kind": "soak"}]}
         found = cast("Any", await asyncio.to_thread(server.request, "POST", "/api/v1/run/plan/check", body))
         assert found["faults"][0]["index"] == 1

@@ -5,29 +5,29 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.nightly import by_night
-from tests.stand.chamber_night import START_NS, Night
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from tests.nightly import mark_nightly
+from tests.stand.chamber_run import START_NS, ChamberRun
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.config.guard_section import HeaterOffConfig
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.plausibility import (
     FollowingBody,
-    measured,
-    together,
-    warming_while_off,
+    combine_surroundings,
+    forbid_warming_while_off,
+    read_channels,
 )
-from thermostand.stand.guarding.rules import Announcements, watches
-from thermostand.stand.guarding.stuck_sensor import stuck_while_other_moves
+from thermostand.stand.guarding.rules import Announcements, make_watches
+from thermostand.stand.guarding.stuck_sensor import forbid_stuck_while_other_moves
 
 
-def faults_of(night: Night) -> list[tuple[float, Fault]]:
+def faults_of(night: ChamberRun) -> list[tuple[float, Fault]]:
     """(s, fault) of everything the whole table says in a night, warnings too."""
-    config, announced = load_config(packaged("", "simulated")), Announcements()
-    rules = watches(config, announced)
+    config, announced = load_config(find_packaged("", "simulated")), Announcements()
+    rules = make_watches(config, announced)
     said: list[tuple[float, Fault]] = []
     for now_ns in night.polls():
         for fault in (watch.check(night.hub, now_ns) for watch in rules):
@@ -41,16 +41,16 @@ def faults_of(night: Night) -> list[tuple[float, Fault]]:
 @pytest.mark.parametrize(
     "night",
     [
-        by_night(Night([24, 60, -10, 52, 10, 24], 3600)),
-        Night([30, 24, 45, 10, 60, 20], 900),
-        by_night(Night([30, 24, 45, 10, 60, 20, 50, 31, 34, 24], 900)),
-        Night([24, 55, 24], 2700, compressor_always=True),
-        by_night(Night([24, 55, 24, 40], 2700, compressor_always=True)),
-        by_night(Night([-10, 60, 0], 3600, laboratory_degC=32)),
-        by_night(Night([60, -10, 60], 3600, laboratory_degC=10)),
-        Night([10], 9000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
-        by_night(Night([10], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
-        by_night(Night([52], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
+        mark_nightly(ChamberRun([24, 60, -10, 52, 10, 24], 3600)),
+        ChamberRun([30, 24, 45, 10, 60, 20], 900),
+        mark_nightly(ChamberRun([30, 24, 45, 10, 60, 20, 50, 31, 34, 24], 900)),
+        ChamberRun([24, 55, 24], 2700, compressor_always=True),
+        mark_nightly(ChamberRun([24, 55, 24, 40], 2700, compressor_always=True)),
+        mark_nightly(ChamberRun([-10, 60, 0], 3600, laboratory_degC=32)),
+        mark_nightly(ChamberRun([60, -10, 60], 3600, laboratory_degC=10)),
+        ChamberRun([10], 9000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
+        mark_nightly(ChamberRun([10], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
+        mark_nightly(ChamberRun([52], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
     ],
     ids=[
         "far",
@@ -65,22 +65,22 @@ def faults_of(night: Night) -> list[tuple[float, Fault]]:
         "cooling down",
     ],
 )
-def test_a_good_night_trips_nothing_and_warns_of_nothing(night: Night):
+def test_a_good_night_trips_nothing_and_warns_of_nothing(night: ChamberRun):
     assert faults_of(night) == []
 
 
-def dead_heater(from_s: float) -> Callable[[Night, float], None]:
-    def disturb(night: Night, time_s: float) -> None:
+def dead_heater(from_s: float) -> Callable[[ChamberRun, float], None]:
+    def disturb(night: ChamberRun, time_s: float) -> None:
         night.plant.cut_out_open = time_s >= from_s
 
     return disturb
 
 
-def welded(share: float) -> Callable[[float], Callable[[Night, float], None]]:
+def welded(share: float) -> Callable[[float], Callable[[ChamberRun, float], None]]:
     """The solid-state relay conducts for that share, whatever the regulator says."""
 
-    def from_(from_s: float) -> Callable[[Night, float], None]:
-        def disturb(night: Night, time_s: float) -> None:
+    def from_(from_s: float) -> Callable[[ChamberRun, float], None]:
+        def disturb(night: ChamberRun, time_s: float) -> None:
             def conduct(time_ns: int, dt_s: float) -> None:
                 night.plant.heater_on_fraction = max(share, night.plant.heater_on_fraction)
 
@@ -92,9 +92,9 @@ def welded(share: float) -> Callable[[float], Callable[[Night, float], None]]:
     return from_
 
 
-def stuck_probe(pv_degC: float) -> Callable[[float], Callable[[Night, float], None]]:
-    def from_(from_s: float) -> Callable[[Night, float], None]:
-        def disturb(night: Night, time_s: float) -> None:
+def stuck_probe(pv_degC: float) -> Callable[[float], Callable[[ChamberRun, float], None]]:
+    def from_(from_s: float) -> Callable[[ChamberRun, float], None]:
+        def disturb(night: ChamberRun, time_s: float) -> None:
             night.regulator.stuck_pv_degC = pv_degC if time_s >= from_s else None
 
         return disturb
@@ -102,16 +102,16 @@ def stuck_probe(pv_degC: float) -> Callable[[float], Callable[[Night, float], No
     return from_
 
 
-def lost_permit(from_s: float) -> Callable[[Night, float], None]:
-    def disturb(night: Night, time_s: float) -> None:
+def lost_permit(from_s: float) -> Callable[[ChamberRun, float], None]:
+    def disturb(night: ChamberRun, time_s: float) -> None:
         night.permitted = time_s < from_s
 
     return disturb
 
 
-def drifting_probe(K_per_h: float) -> Callable[[float], Callable[[Night, float], None]]:
-    def from_(from_s: float) -> Callable[[Night, float], None]:
-        def disturb(night: Night, time_s: float) -> None:
+def drifting_probe(K_per_h: float) -> Callable[[float], Callable[[ChamberRun, float], None]]:
+    def from_(from_s: float) -> Callable[[ChamberRun, float], None]:
+        def disturb(night: ChamberRun, time_s: float) -> None:
             night.regulator.pv_offset_K = max(0.0, time_s - from_s) * K_per_h / 3600
 
         return disturb
@@ -151,14 +151,14 @@ def drifting_probe(K_per_h: float) -> Callable[[float], Callable[[Night, float],
     ],
 )
 def test_what_breaks_is_found_in_time(
-    break_it: Callable[[float], Callable[[Night, float], None]],
+    break_it: Callable[[float], Callable[[ChamberRun, float], None]],
     from_s: float,
     set_points_degC: list[float],
     rule: str,
     action: str,
     within_s: float,
 ):
-    time_s, fault = faults_of(Night(set_points_degC, 3600, disturb=break_it(from_s)))[0]
+    time_s, fault = faults_of(ChamberRun(set_points_degC, 3600, disturb=break_it(from_s)))[0]
     assert (fault.rule, fault.action) == (rule, action)
     assert from_s < time_s <= from_s + within_s
 
@@ -183,10 +183,10 @@ def publish(hub: Hub, channel: str, value: float) -> None:
 def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_change_is(
     air_K: Callable[[int], float], found_s: int | None
 ):
-    hub, rule, said_s = Hub(), stuck_while_other_moves(PV, AIR), list[int]()
+    hub, rule, said_s = Hub(), forbid_stuck_while_other_moves(PV, AIR), list[int]()
     publish(hub, PV, 24.0)
     for second in range(0, 4600, 5):
-        now_ns, after_s = seconds_ns(second), second - 4000
+        now_ns, after_s = to_ns(second), second - 4000
         air_degC = 24.0 + 0.4 * math.sin(second / 300) + (air_K(after_s) if after_s >= 0 else 0.0)
         hub.publish(Batch("device", now_ns, (Reading(AIR, air_degC, "degC", now_ns),)))
         if (fault := rule(hub, now_ns)) is not None:
@@ -194,7 +194,7 @@ def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_c
             said_s.append(after_s)
     assert said_s[:1] == ([] if found_s is None else [found_s])
     publish(hub, PV, 24.1)
-    assert rule(hub, seconds_ns(4601)) is None
+    assert rule(hub, to_ns(4601)) is None
 
 
 def publish_all(hub: Hub, values: dict[str, float]) -> None:
@@ -242,45 +242,45 @@ def test_air_that_rises_with_the_heater_off_was_heated_unless_something_else_can
 ):
     """From 30 to 36 degC in 500 s, with one look, the first that counts, in which the air could not be read."""
     hub = Hub()
-    rule = warming_while_off(
+    rule = forbid_warming_while_off(
         HeaterOffConfig(rise_K=2.0),
         AIR,
         "regulator",
         PERMIT,
-        measured(LABORATORY, GRANITE),
+        read_channels(LABORATORY, GRANITE),
     )
     publish_all(hub, WELDED | changed)
     found_s: list[int] = []
     for second in range(0, 500, 10):
         publish(hub, AIR, math.nan if second == 120 else 30.0 + second / 80)
-        if rule(hub, seconds_ns(second)) is not None:
+        if rule(hub, to_ns(second)) is not None:
             found_s.append(second)
     assert found_s[:1] == ([290] if trips else [])
 
 
 def test_a_granite_without_a_thermometer_is_taken_for_what_the_air_makes_of_it():
     hub, granite = Hub(), FollowingBody(AIR, lag_s=4000.0, warmest_degC=40.0)
-    around = together(measured(LABORATORY), granite)
+    around = combine_surroundings(read_channels(LABORATORY), granite)
     publish_all(hub, {AIR: 20.0, LABORATORY: 24.0})
     assert around(hub, 0) == (24.0, 40.0)
     for second in range(10, 4001, 10):
-        found = around(hub, seconds_ns(second))
+        found = around(hub, to_ns(second))
     assert found == (24.0, pytest.approx(20 + 20 * math.exp(-1)))
     publish(hub, AIR, math.nan)  # unknown air leaves it as it is
-    assert around(hub, seconds_ns(8000)) == found
+    assert around(hub, to_ns(8000)) == found
     publish(hub, AIR, 60.0)
     for second in range(8000, 40_000, 100):
-        found = around(hub, seconds_ns(second))
+        found = around(hub, to_ns(second))
     assert found[1] == pytest.approx(60.0, abs=0.1)
 
 
 def test_on_a_stand_without_the_granite_a_welded_relay_is_found_once_the_air_is_above_all_that_could_warm_it():
     hub = Hub()
-    rule = warming_while_off(HeaterOffConfig(), AIR, "regulator", PERMIT, FollowingBody(AIR, 4300.0, 40.0))
+    rule = forbid_warming_while_off(HeaterOffConfig(), AIR, "regulator", PERMIT, FollowingBody(AIR, 4300.0, 40.0))
     publish_all(hub, WELDED | {GRANITE: math.nan, LABORATORY: math.nan})
     found_s: list[int] = []
     for second in range(0, 30_000, 10):
         publish(hub, AIR, 24.0 if second < 20_000 else 24.0 + (second - 20_000) / 100)
-        if rule(hub, seconds_ns(second)) is not None:
+        if rule(hub, to_ns(second)) is not None:
             found_s.append(second)
     assert 20_500 <= found_s[0] < 20_600  # 5 K above what the air was, 24.4 degC by then

@@ -5,12 +5,12 @@ from typing import cast
 import pytest
 
 from thermostand.drivers.devices.protocols import Sensor
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.errors import DeviceError, GarbledReply, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
-from thermostand.foundation.repeats import RepeatLimit
+from thermostand.foundation.repeat_limit import RepeatLimit
 from thermostand.stand.poller import Poller
 
 
@@ -23,7 +23,7 @@ class Slow:
         self.clock, self.takes_s, self.failures = clock, 0.0, list[DeviceError]()
 
     async def read(self) -> tuple[Reading, ...]:
-        self.clock.advance_ns(seconds_ns(self.takes_s))
+        self.clock.advance_ns(to_ns(self.takes_s))
         if self.failures:
             raise self.failures.pop()
         return (Reading("thermometers.air", 20.0, "degC", self.clock.now_ns()),)
@@ -63,7 +63,7 @@ async def test_a_device_that_comes_and_goes_is_told_three_times_and_its_end_once
     poller = Poller(cast(Sensor, device), 1.0, hub, clock)
     await poller.first()
     for number in range(2400):
-        clock.advance_ns(seconds_ns(3.0))
+        clock.advance_ns(to_ns(3.0))
         if number < 1000 and number % 4 == 0:
             if kind == "device_slow":
                 device.takes_s = 1.5
@@ -74,5 +74,5 @@ async def test_a_device_that_comes_and_goes_is_told_three_times_and_its_end_once
         device.takes_s = 0.0
     assert [event.kind for event in events] == 3 * [kind, over]
     assert events[-1].data["repeated"] == 247
-    last_ns = 996 * seconds_ns(3.0)
-    assert seconds_ns(1190) < events[-1].time_ns - last_ns < seconds_ns(1600)
+    last_ns = 996 * to_ns(3.0)
+    assert to_ns(1190) < events[-1].time_ns - last_ns < to_ns(1600)

@@ -7,10 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.compensation.rendered import Scene, photograph, render, true_centres_px
+from tests.compensation.renderer import Scene, compute_true_centres_px, photograph, render
 from thermostand.markers.detection import detect
 from thermostand.markers.target import load_target
-from thermostand.stand.serving.preview import Previewer, half_jpeg, keystone_percent, setup_of, tilt_deg
+from thermostand.stand.serving.preview import (
+    Previewer,
+    compute_keystone_percent,
+    compute_tilt_deg,
+    encode_half_jpeg,
+    measure_setup,
+)
 from thermostand.stand.serving.shot import FrameShot
 
 PAPER = load_target(Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml")
@@ -36,13 +42,13 @@ def test_drift_is_shown_against_the_reference_and_is_the_true_one():
     first = previewer.look(shot(SMALL, role="reference", as_reference=True))
     assert (first.mean_px, first.expected, len(first.markers)) == (0.0, 54, 54)
     then = previewer.look(shot(MOVED, 2, role="fit"))
-    truth = true_centres_px(MOVED) - true_centres_px(SMALL)
+    truth = compute_true_centres_px(MOVED) - compute_true_centres_px(SMALL)
     assert then.reference_ns == 1
     assert then.mean_px == pytest.approx(np.hypot(*truth.mean(axis=0)), abs=0.005)
     assert (then.mean_dx, then.mean_dy) == pytest.approx(truth.mean(axis=0), abs=0.005)
     assert then.worst_px == pytest.approx(np.hypot(*truth.T).max(), abs=0.03)
     number, x, y, dx, dy = then.markers[10]
-    assert (x, y) == pytest.approx(true_centres_px(MOVED)[number - 1], abs=0.06)
+    assert (x, y) == pytest.approx(compute_true_centres_px(MOVED)[number - 1], abs=0.06)
     assert (dx, dy) == pytest.approx(truth[number - 1], abs=0.06)
 
 
@@ -66,7 +72,7 @@ def test_a_frame_without_the_target_says_why_and_is_shown_all_the_same():
 
 def test_the_picture_has_half_the_size_also_of_sixteen_bits():
     for image in (image_of(SMALL), image_of(SMALL).astype(np.uint16) << 8):
-        back = cv2.imdecode(np.frombuffer(half_jpeg(image), np.uint8), cv2.IMREAD_UNCHANGED)
+        back = cv2.imdecode(np.frombuffer(encode_half_jpeg(image), np.uint8), cv2.IMREAD_UNCHANGED)
         assert back.shape == (256, 306)
         assert abs(float(back.mean()) - float(image_of(SMALL).mean())) < 2
 
@@ -82,7 +88,7 @@ def test_the_edges_are_as_wide_as_the_blur_makes_them():
 def test_too_much_light_is_reported():
     image = image_of(SMALL).copy()
     image[:128] = 255
-    setup = setup_of(image, None, PAPER)
+    setup = measure_setup(image, None, PAPER)
     assert setup.saturated == pytest.approx(0.25, abs=0.001)
     assert sum(setup.histogram) == pytest.approx(1, abs=1e-3)
 
@@ -92,13 +98,13 @@ def test_the_tilt_of_the_target_is_reported(x_deg, y_deg):
     scene = replace(SMALL, tilt_x_deg=x_deg, tilt_y_deg=y_deg)
     found = detect(image_of(scene), PAPER)
     normal = np.cos(np.radians(x_deg)) * np.cos(np.radians(y_deg))
-    assert tilt_deg(found.homography, PAPER) == pytest.approx(np.degrees(np.arccos(normal)), abs=1.0)
+    assert compute_tilt_deg(found.homography, PAPER) == pytest.approx(np.degrees(np.arccos(normal)), abs=1.0)
 
 
 def test_a_target_that_faces_the_camera_has_no_tilt_and_no_keystone():
     found = detect(image_of(SMALL), PAPER)
-    assert tilt_deg(found.homography, PAPER) is None
-    assert keystone_percent(found.homography, PAPER) == pytest.approx((0, 0), abs=0.05)
+    assert compute_tilt_deg(found.homography, PAPER) is None
+    assert compute_keystone_percent(found.homography, PAPER) == pytest.approx((0, 0), abs=0.05)
 
 
 @pytest.mark.parametrize("tilt", ["tilt_x_deg", "tilt_y_deg"])
@@ -106,12 +112,12 @@ def test_the_keystone_shows_which_side_is_nearer(tilt):
     """The scale at each end of the target, from the true centres of its outer markers."""
     scene = replace(SMALL, **{tilt: 10.0})
     found = detect(image_of(scene), PAPER)
-    centres = true_centres_px(scene).reshape(6, 9, 2)
+    centres = compute_true_centres_px(scene).reshape(6, 9, 2)
     gaps_down, gaps_across = np.abs(np.diff(centres[:, :, 1], axis=0)), np.abs(np.diff(centres[:, :, 0], axis=1))
     column, row = np.argsort(centres[0, :, 0]), np.argsort(centres[:, 0, 1])
     right_left = gaps_down[:, column[-1]].mean() / gaps_down[:, column[0]].mean() - 1
     low_up = gaps_across[row[-1]].mean() / gaps_across[row[0]].mean() - 1
-    across, down = keystone_percent(found.homography, PAPER)
+    across, down = compute_keystone_percent(found.homography, PAPER)
     if tilt == "tilt_y_deg":
         assert across / 100 == pytest.approx(np.sign(right_left) * abs(right_left) * 1.0, rel=0.6)
         assert abs(down) < 0.3

@@ -9,14 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.recording.damage import write_segment
-from thermostand.foundation.progress import late_progress
+from thermostand.foundation.progress import show_late_progress
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.stand.commands.sessions.session_commands import app
 
 
 def test_short_work_is_not_shown(capsys: pytest.CaptureFixture[str]):
-    with late_progress("repair", 10.0) as report:
+    with show_late_progress("repair", 10.0) as report:
         for done in range(10):
             report(done, "0001.mcap")
     assert capsys.readouterr().err == ""
@@ -26,7 +26,7 @@ def test_long_work_is_shown_from_its_first_report_on_and_then_at_each_tenth(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("thermostand.foundation.progress._LATE_NS", 0)
-    with late_progress("repair", 10.0) as report:
+    with show_late_progress("repair", 10.0) as report:
         for done in (0.01, 0.02, 1.0, 1.5, 9.0):
             report(done, "0001.mcap")
     lines = capsys.readouterr().err.splitlines()

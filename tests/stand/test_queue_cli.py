@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.stand.commands.queue_cli import app
-from thermostand.stand.serving.desk import QueuedRun, StandState
+from thermostand.stand.serving.api_models import QueuedRun, StandState
 
 
-class Halted(ADesk):
+class Halted(FakeService):
     """Its last run has failed."""
 
     def state(self) -> StandState:
@@ -26,7 +26,7 @@ async def invoke(out: Path, *arguments: object) -> Result:
 async def test_runs_are_added_listed_moved_and_removed(tmp_path: Path):
     recipe = tmp_path / "night.yaml"
     recipe.write_text("name: night\n")
-    async with served(ADesk(), tmp_path) as desk:
+    async with serve_fake(FakeService(), tmp_path) as desk:
         assert (await invoke(tmp_path, "add", "demo")).stdout == "1\n"
         assert (await invoke(tmp_path, "add", recipe, "--tag", "lens-a", "--note", "new lens")).stdout == "2\n"
         recipe.unlink()  # what is queued is what the file was
@@ -58,7 +58,7 @@ async def test_what_has_ended_and_why_nothing_is_begun_are_listed(tmp_path: Path
     desk, took_ns = Halted(), 7_500_000_000_000
     ended = {"state": "failed", "began_ns": 0, "ended_ns": took_ns, "reason": "too\nwarm"}
     desk.queue = [QueuedRun(id=1, recipe="demo", added_ns=0, **ended)]
-    async with served(desk, tmp_path):
+    async with serve_fake(desk, tmp_path):
         result = await invoke(tmp_path, "list")
     assert "2:05:00" in result.stdout
     assert result.stdout.rstrip().endswith("too\\nwarm")
@@ -67,13 +67,13 @@ async def test_what_has_ended_and_why_nothing_is_begun_are_listed(tmp_path: Path
 
 @pytest.mark.parametrize("arguments", [("move", "one", 1), ("move", 1), ("add",)])
 async def test_a_mistake_is_reported_in_one_line_and_orders_nothing(tmp_path: Path, arguments: tuple[object, ...]):
-    async with served(ADesk(), tmp_path) as desk:
+    async with serve_fake(FakeService(), tmp_path) as desk:
         result = await asyncio.to_thread(CliRunner().invoke, app, list(map(str, arguments)))
     assert (result.exit_code, len(result.stderr.splitlines()), desk.orders) == (2, 1, [])
 
 
 async def test_an_empty_queue_has_nothing_to_list(tmp_path: Path):
-    async with served(ADesk(), tmp_path):
+    async with serve_fake(FakeService(), tmp_path):
         result = await invoke(tmp_path, "list")
         assert (result.exit_code, result.stdout, result.stderr) == (0, "", f"{tmp_path}: nothing is queued there\n")
         assert json.loads((await invoke(tmp_path, "list", "--json")).stdout) == {"halted": "", "runs": []}

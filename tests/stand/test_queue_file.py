@@ -12,22 +12,29 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from tests import forked
+from tests import fork_server
 from tests.recording.disks import limit_files
 from thermostand.foundation.errors import ConfigError, SessionError, StandTripped
 from thermostand.stand.running.order import Order, load_order
 from thermostand.stand.service import queue
-from thermostand.stand.service.queue_file import KEPT_ENDED, LAST_NAME, QUEUE_NAME, QueueState, changing, working
+from thermostand.stand.service.queue_file import (
+    KEPT_ENDED,
+    LAST_NAME,
+    QUEUE_NAME,
+    QueueState,
+    change_queue,
+    lock_worker,
+)
 
 ORDER = load_order("warm-up", "simulated")
 
 
 def add(directory: Path, order: Order = ORDER) -> int:
-    return queue.append(directory, queue.entry_of(order, "simulated", 1)).id
+    return queue.append(directory, queue.make_entry(order, "simulated", 1)).id
 
 
 def states(directory: Path) -> list[tuple[int, str]]:
-    return [(entry.id, entry.state) for entry in queue.queued(directory).entries]
+    return [(entry.id, entry.state) for entry in queue.load_queue(directory).entries]
 
 
 class QueueAgainstAList(RuleBasedStateMachine):
@@ -87,7 +94,7 @@ class QueueAgainstAList(RuleBasedStateMachine):
     @precondition(lambda self: self.worker is None and self.added)
     @rule()
     def daemon_starts(self) -> None:
-        self.worker = working(self.directory)
+        self.worker = lock_worker(self.directory)
         self.worker.__enter__()
 
     @precondition(lambda self: self.worker is not None and self.running is None)
@@ -138,8 +145,8 @@ def test_what_is_queued_is_what_the_files_were_when_they_were_added(tmp_path: Pa
     recipe.write_text("name: mine\nexperiments: [{warm_up: {}}]\n")
     number = add(tmp_path, load_order(str(recipe), "simulated"))
     recipe.write_text("name: other\n")
-    entry = queue.queued(tmp_path).entries[0]
-    order = queue.order_of(entry)
+    entry = queue.load_queue(tmp_path).entries[0]
+    order = queue.make_order(entry)
     assert (entry.id, entry.recipe, order.recipe.name) == (number, "mine", "mine")
     assert (order.config, order.target_text) == (ORDER.config, ORDER.target_text)
 
@@ -167,25 +174,25 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path):
 
 def test_what_this_version_refuses_is_named_with_its_run(tmp_path: Path):
     add(tmp_path)
-    entry = queue.queued(tmp_path).entries[0].model_copy(update={"recipe_text": "name: x\n"})
+    entry = queue.load_queue(tmp_path).entries[0].model_copy(update={"recipe_text": "name: x\n"})
     with pytest.raises(ConfigError, match="run 1 of the queue: warm-up: "):
-        queue.order_of(entry)
+        queue.make_order(entry)
 
 
 def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
     add(tmp_path)
     add(tmp_path)
-    with working(tmp_path):
+    with lock_worker(tmp_path):
         queue.take(tmp_path, 5)
         queue.note_session(tmp_path, 1, tmp_path / "night")
-    interrupted, _ = queue.queued(tmp_path).entries
+    interrupted, _ = queue.load_queue(tmp_path).entries
     assert (interrupted.state, interrupted.session, interrupted.began_ns) == ("interrupted", "night", 5)
     assert interrupted.reason == "its daemon was killed"
-    with working(tmp_path):
+    with lock_worker(tmp_path):
         again = queue.take(tmp_path, 9)
         assert again is not None
         assert (again.id, again.session) == (1, "night")
-        running = queue.queued(tmp_path).entries[0]
+        running = queue.load_queue(tmp_path).entries[0]
         assert (running.state, running.began_ns, running.reason) == ("running", 5, "")
         with pytest.raises(SessionError, match="run 1 is running; one"):
             queue.take(tmp_path, 9)
@@ -198,10 +205,10 @@ def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
 def test_of_the_runs_that_have_ended_the_latest_are_kept(tmp_path: Path):
     waiting = add(tmp_path)
     ended = tuple(
-        queue.queued(tmp_path).entries[0].model_copy(update={"id": number, "state": QueueState.DONE})
+        queue.load_queue(tmp_path).entries[0].model_copy(update={"id": number, "state": QueueState.DONE})
         for number in range(2, KEPT_ENDED + 20)
     )
-    with changing(tmp_path) as draft:
+    with change_queue(tmp_path) as draft:
         draft.set(entries=(*ended, *draft.queue.entries), next_id=1000)
     assert [number for number, _ in states(tmp_path)] == [each.id for each in ended[-KEPT_ENDED:]] + [waiting]
     assert add(tmp_path) == 1000
@@ -210,7 +217,7 @@ def test_of_the_runs_that_have_ended_the_latest_are_kept(tmp_path: Path):
 def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
     add(tmp_path)
     add(tmp_path)
-    with working(tmp_path):
+    with lock_worker(tmp_path):
         queue.take(tmp_path, 2)
         queue.finish(tmp_path, 1, QueueState.FAILED, 3, "air is too warm", halt=True)
         with pytest.raises(StandTripped, match=r"halted: run 1: air is too warm"):
@@ -222,12 +229,12 @@ def test_a_halted_queue_gives_nothing_until_it_is_cleared(tmp_path: Path):
 
 def test_only_one_works_a_queue(tmp_path: Path):
     with (
-        working(tmp_path),
+        lock_worker(tmp_path),
         pytest.raises(SessionError, match="running its queue"),
-        working(tmp_path),
+        lock_worker(tmp_path),
     ):
         pass
-    with working(tmp_path):
+    with lock_worker(tmp_path):
         pass
 
 
@@ -256,7 +263,8 @@ def test_two_processes_at_once_lose_nothing(tmp_path: Path):
     with contextlib.ExitStack() as stack:
         command = [sys.executable, "-m", "tests.code", ADDING, str(tmp_path)]
         processes = [
-            stack.enter_context(forked.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)) for _ in range(2)
+            stack.enter_context(fork_server.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+            for _ in range(2)
         ]
         for process in processes:
             assert process.stdout is not None
@@ -283,7 +291,7 @@ def test_a_damaged_file_is_named_left_alone_and_can_be_put_right(tmp_path: Path,
     path = tmp_path / QUEUE_NAME
     damaged = damage(path.read_bytes())
     path.write_bytes(damaged)
-    for attempt in (lambda: add(tmp_path), lambda: queue.queued(tmp_path), lambda: queue.take(tmp_path, 1)):
+    for attempt in (lambda: add(tmp_path), lambda: queue.load_queue(tmp_path), lambda: queue.take(tmp_path, 1)):
         with pytest.raises(SessionError, match=r"queue\.json: is damaged .*queue\.json\.last beside it is") as caught:
             attempt()
         assert "\n" not in str(caught.value)
@@ -298,11 +306,11 @@ def test_a_queue_that_is_gone_or_as_it_was_before_its_last_change_is_none_to_go_
         add(tmp_path)
     path, last = tmp_path / QUEUE_NAME, tmp_path / LAST_NAME
     path.write_bytes(last.read_bytes())
-    for attempt in (lambda: add(tmp_path), lambda: queue.queued(tmp_path)):
+    for attempt in (lambda: add(tmp_path), lambda: queue.load_queue(tmp_path)):
         with pytest.raises(SessionError, match=r"lost its last change; .* then remove queue\.json\.last"):
             attempt()
     path.unlink()
-    for attempt in (lambda: add(tmp_path), lambda: queue.queued(tmp_path)):
+    for attempt in (lambda: add(tmp_path), lambda: queue.load_queue(tmp_path)):
         with pytest.raises(SessionError, match=r"is missing; queue\.json\.last beside it is .*: rename it"):
             attempt()
     last.rename(path)
@@ -313,7 +321,7 @@ def test_a_change_that_is_taken_back_is_no_change_that_was_lost(tmp_path: Path):
     add(tmp_path)
     first = (tmp_path / QUEUE_NAME).read_bytes()
     for reason in ("a trip", ""):
-        with changing(tmp_path) as draft:
+        with change_queue(tmp_path) as draft:
             draft.set(halted=reason)
     (tmp_path / LAST_NAME).write_bytes(first)  # the power failed before that of the last change was there
     assert states(tmp_path) == [(1, "waiting")]

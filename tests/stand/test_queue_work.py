@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from tests import forked
+from tests import fork_server
 from tests.stand.killed_queue import work
 from thermostand.foundation.clock import FollowedClock
 from thermostand.foundation.errors import DeviceFault, InUse, SessionError, StandTripped, Unreachable
 from thermostand.stand.running.opening.stop import Interrupted
 from thermostand.stand.running.order import load_order
 from thermostand.stand.service import queue
-from thermostand.stand.service.queue_file import QueueEntry, working
-from thermostand.stand.service.queue_work import MOST_FRUITLESS_STARTS, Halt, RunNotes, Stopped
+from thermostand.stand.service.queue_file import QueueEntry, lock_worker
+from thermostand.stand.service.queue_worker import MOST_FRUITLESS_STARTS, Halt, RunNotes, Stopped
 
 ORDER = load_order("warm-up", "simulated")
 
@@ -31,7 +31,7 @@ class Runs:
         self.lines: list[str] = []
         self.seen: list[tuple[int, str]] = []
         for _ in ends:
-            queue.append(directory, queue.entry_of(ORDER, "simulated", 1))
+            queue.append(directory, queue.make_entry(ORDER, "simulated", 1))
 
     async def run(self, entry: QueueEntry, notes: RunNotes) -> Path:
         self.seen.append((entry.id, entry.session))
@@ -48,7 +48,7 @@ class Runs:
         await work(self.directory, self.run, FollowedClock(7), self.lines.append)
 
     def entries(self) -> list[tuple[str, str, str]]:
-        return [(entry.state, entry.session, entry.reason) for entry in queue.queued(self.directory).entries]
+        return [(entry.state, entry.session, entry.reason) for entry in queue.load_queue(self.directory).entries]
 
 
 async def test_all_that_is_queued_is_run_in_turn(tmp_path: Path):
@@ -58,7 +58,7 @@ async def test_all_that_is_queued_is_run_in_turn(tmp_path: Path):
     assert runs.seen == [(2, ""), (1, "")]
     assert runs.entries() == [("done", "session-2", ""), ("done", "session-1", "")]
     assert runs.lines[:2] == ["run 2 (warm-up) begins", "run 2 (warm-up) done"]
-    assert queue.queued(tmp_path).entries[0].ended_ns == 7
+    assert queue.load_queue(tmp_path).entries[0].ended_ns == 7
     await runs.work()  # nothing is left
 
 
@@ -67,7 +67,7 @@ async def test_what_is_added_while_a_run_is_under_way_has_its_turn(tmp_path: Pat
 
     async def run(entry: QueueEntry, notes: RunNotes) -> Path:
         if entry.id == 1:
-            queue.append(tmp_path, queue.entry_of(ORDER, "simulated", 1))
+            queue.append(tmp_path, queue.make_entry(ORDER, "simulated", 1))
         return tmp_path / str(entry.id)
 
     await work(tmp_path, run, FollowedClock(7), runs.lines.append)
@@ -81,7 +81,7 @@ async def test_a_stand_that_another_run_has_ends_the_work_and_fails_no_run(tmp_p
     with pytest.raises(InUse, match="by session night"):
         await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["interrupted", "waiting"]
-    assert queue.queued(tmp_path).halted == ""
+    assert queue.load_queue(tmp_path).halted == ""
     runs.ends.append(None)
     await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["done", "done"]
@@ -116,7 +116,7 @@ async def test_a_run_that_an_operator_ends_is_stopped_and_not_failed(tmp_path: P
         await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["stopped", "stopped", "waiting"]
     assert runs.entries()[0][2] == "stopped by the operator"
-    assert queue.queued(tmp_path).halted == "run 2: again"
+    assert queue.load_queue(tmp_path).halted == "run 2: again"
     queue.reset(tmp_path)
     await runs.work()
     assert [entry[0] for entry in runs.entries()] == ["stopped", "stopped", "done"]
@@ -127,7 +127,7 @@ async def test_a_stand_that_cannot_be_opened_does_not_use_up_the_queue(tmp_path:
     with pytest.raises(Unreachable):
         await runs.work()
     assert runs.entries() == [("failed", "", "regulator: no answer"), ("waiting", "", "")]
-    assert queue.queued(tmp_path).halted == "run 1: regulator: no answer"
+    assert queue.load_queue(tmp_path).halted == "run 1: regulator: no answer"
 
 
 @pytest.mark.parametrize("error", [Interrupted("stopped; the stand is safe"), asyncio.CancelledError()])
@@ -162,7 +162,7 @@ async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Its lock stands for a disk that hangs."""
-    monkeypatch.setattr("thermostand.stand.service.queue_work._NOTED_WITHIN_S", 0.1)
+    monkeypatch.setattr("thermostand.stand.service.queue_worker._NOTED_WITHIN_S", 0.1)
     runs = Runs(tmp_path, None)
     with (tmp_path / ".queue.lock").open("w") as lock:
 
@@ -179,19 +179,19 @@ async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
 
 async def test_a_second_worker_is_refused(tmp_path: Path):
     runs = Runs(tmp_path, None)
-    with working(tmp_path), pytest.raises(SessionError, match="running its queue"):
+    with lock_worker(tmp_path), pytest.raises(SessionError, match="running its queue"):
         await runs.work()
 
 
 def worker_killed(directory: Path, steps_done: int) -> None:
     """A process that works the queue is killed when its run has finished so many steps."""
     command = [sys.executable, "-m", "tests.stand.killed_queue", str(directory), str(steps_done)]
-    assert forked.run(command, timeout=60).returncode == -signal.SIGKILL
+    assert fork_server.run(command, timeout=60).returncode == -signal.SIGKILL
 
 
 async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_set_aside(tmp_path: Path):
     runs = Runs(tmp_path, None)
-    queue.append(tmp_path, queue.entry_of(ORDER, "simulated", 1))
+    queue.append(tmp_path, queue.make_entry(ORDER, "simulated", 1))
     for steps_done in (0, 0, 2, 0, 0, 0):  # what the third has done begins the count again
         worker_killed(tmp_path, steps_done)
         assert runs.entries()[0] == ("interrupted", "night", "its daemon was killed")

@@ -14,8 +14,8 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import PLAN_CHANGED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, StepMark, StepState
-from thermostand.foundation.patience import Patience
-from thermostand.recording.format.restarts import restarted
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
+from thermostand.recording.format.capture_restarts import make_restart_event
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING
 from thermostand.stand.running.memory.entries import (
@@ -29,11 +29,11 @@ from thermostand.stand.running.memory.entries import (
     StepChanged,
     Taken,
     Tripped,
-    data_of,
+    make_change_data,
 )
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
-from thermostand.stand.running.resume import Interruption, with_recorded
+from thermostand.stand.running.resume import Interruption, merge_recorded
 
 BEGUN = Begun(1, "night-1", "0f", {})
 
@@ -43,14 +43,14 @@ def mark(time_ns: int, step_id: str, state: StepState) -> StepMark:
 
 
 def plan_changed(change: Skipped) -> Event:
-    return Event(change.time_ns, "warning", PLAN_CHANGED, "left out", data_of(change))
+    return Event(change.time_ns, "warning", PLAN_CHANGED, "left out", make_change_data(change))
 
 
 def test_a_step_is_done_when_its_end_is_recorded_and_not_when_it_was_begun_or_failed():
     started = StepChanged(2, CAPTURE, "started")
     items = [mark(2, CAPTURE, StepState.STARTED), mark(5, WARM, StepState.FAILED), mark(4, CAPTURE, StepState.DONE)]
     frames = [(3, CAPTURE)]
-    assert with_recorded([BEGUN, started], items, frames) == [
+    assert merge_recorded([BEGUN, started], items, frames) == [
         BEGUN,
         started,
         Taken(3, CAPTURE),
@@ -60,20 +60,24 @@ def test_a_step_is_done_when_its_end_is_recorded_and_not_when_it_was_begun_or_fa
 
 def test_a_capture_that_was_begun_again_and_a_change_of_the_plan_count_once_be_they_in_the_journal_or_not():
     again, skipped = Again(5, [CAPTURE], 2), Skipped(7, WARM)
-    items = [restarted(5, CAPTURE, 3, "", 2), plan_changed(skipped), Event(8, "info", "note", "x", data_of(skipped))]
+    items = [
+        make_restart_event(5, CAPTURE, 3, "", 2),
+        plan_changed(skipped),
+        Event(8, "info", "note", "x", make_change_data(skipped)),
+    ]
     whole: list[Entry] = [BEGUN, again, skipped]
-    assert with_recorded([BEGUN], items, []) == whole
-    assert with_recorded([BEGUN, again], items, []) == whole
-    assert with_recorded([BEGUN, skipped], items, []) == whole
-    assert with_recorded([BEGUN, again, skipped], items, []) == whole
+    assert merge_recorded([BEGUN], items, []) == whole
+    assert merge_recorded([BEGUN, again], items, []) == whole
+    assert merge_recorded([BEGUN, skipped], items, []) == whole
+    assert merge_recorded([BEGUN, again, skipped], items, []) == whole
     other = Again(5, [WARM])
-    assert with_recorded([BEGUN, other], items[:1], []) == [BEGUN, other, again]
+    assert merge_recorded([BEGUN, other], items[:1], []) == [BEGUN, other, again]
 
 
 def test_of_an_instant_in_which_a_capture_is_begun_again_its_end_before_does_not_count_but_its_frame():
     again = Again(5, [CAPTURE])
     items = [mark(5, CAPTURE, StepState.DONE)]
-    assert with_recorded([BEGUN, again], items, [(5, CAPTURE)]) == [
+    assert merge_recorded([BEGUN, again], items, [(5, CAPTURE)]) == [
         BEGUN,
         StepChanged(5, CAPTURE, "done"),
         again,
@@ -102,7 +106,7 @@ async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp
     logbook.enter(Reset(5))
     await logbook.begin(journal, BEGUN)
     for reason, held in ((OPERATOR, True), (STOPPING, True), (INTERLOCK, True), (OPERATOR, False), (INTERLOCK, False)):
-        logbook.held(reason, held)
+        logbook.note_hold(reason, held)
     logbook.tripped(Fault("air_hot", "too hot"))
     assert [(event.kind, event.data["reason"]) for event in events] == [
         ("held", OPERATOR),
@@ -125,10 +129,10 @@ async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp
 
 async def test_the_end_of_a_run_is_the_last_entry_of_its_journal_which_nobody_has_then(tmp_path: Path):
     logbook = Logbook(Hub(), WallClock(), fold(PLAN, []))
-    await logbook.end(Ended(1, "stopped", ""), Patience())  # nothing was begun
+    await logbook.end(Ended(1, "stopped", ""), ShutdownDeadline())  # nothing was begun
     await logbook.begin(Journal.create(tmp_path), BEGUN)
     await logbook.write(StepChanged(2, ID[0], "started"))
-    await logbook.end(Ended(3, "stopped", "by the operator"), Patience())
+    await logbook.end(Ended(3, "stopped", "by the operator"), ShutdownDeadline())
     journal, entries = Journal.open(tmp_path)
     journal.release()
     assert entries[:2] == [BEGUN, StepChanged(2, ID[0], "started")]

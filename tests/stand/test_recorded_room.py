@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.recorded import record
-from tests.stand.a_desk import ADesk, served
+from tests.recording.full_session import record
+from tests.stand.fake_service import FakeService, serve_fake
 from tests.stand.test_interface_access import ask, free_port
-from thermostand.stand.serving.api import recorded
+from thermostand.stand.serving.api import session_routes
 from thermostand.stand.serving.api.bridge import NoAnswer
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.api.recorded import REPORT, REPORT_CSP, RecordedDisk
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.api.session_routes import REPORT, REPORT_CSP, DiskReader
 
 
 async def test_a_disk_that_hangs_keeps_neither_the_interface_nor_the_process(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recorded, "_DISK_LIMIT_S", 0.1)
-    hangs, disk = threading.Event(), RecordedDisk()
+    monkeypatch.setattr(session_routes, "_DISK_LIMIT_S", 0.1)
+    hangs, disk = threading.Event(), DiskReader()
     with pytest.raises(NoAnswer, match="has not answered"):
         await disk.ask(lambda: hangs.wait(60))
     assert all(thread.daemon for thread in threading.enumerate() if thread.name == "disk")
@@ -41,7 +41,7 @@ async def test_sessions_and_their_reports_are_read_and_links_are_not_followed(tm
     async def get(path: str) -> tuple[int, dict[str, str], bytes]:
         return await asyncio.to_thread(ask, port, "GET", f"/api/v1{path}")
 
-    async with served(ADesk(), tmp_path / "night", Interface(folder, port=port)):
+    async with serve_fake(FakeService(), tmp_path / "night", Interface(folder, port=port)):
         listed = json.loads((await get("/sessions"))[2])
         night = next(entry for entry in listed if entry["name"] == "night")
         assert (night["frames"], night["files"], night["has_report"]) == (12, "sound", True)
@@ -59,5 +59,5 @@ async def test_sessions_and_their_reports_are_read_and_links_are_not_followed(tm
 
 async def test_without_a_folder_there_are_no_sessions(tmp_path: Path):
     port = free_port()
-    async with served(ADesk(), tmp_path / "night", Interface(tmp_path / "nowhere", port=port)):
+    async with serve_fake(FakeService(), tmp_path / "night", Interface(tmp_path / "nowhere", port=port)):
         assert (await asyncio.to_thread(ask, port, "GET", "/api/v1/sessions"))[2] == b"[]"

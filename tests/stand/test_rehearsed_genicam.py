@@ -12,7 +12,7 @@ from tests.system.conftest import require_aravis
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.commissioning.genicam_rehearsal import rehearse
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 
 
 async def test_a_file_tells_which_features_would_be_used(tmp_path: Path):
@@ -145,5 +145,5 @@ async def test_the_exposure_of_ones_own_stand_is_tried_and_without_one_such_as_e
     words = text[begin:end].replace("FloatReg", "IntReg").replace("Float", "Integer").replace("<Length>8", "<Length>2")
     file.write_text(text[:begin] + words + text[end:])  # 16 bits: no more than 65.535 ms
     assert (await rehearse(file)).refusal == ""
-    refused = await rehearse(file, load_config(packaged("", "simulated")))
+    refused = await rehearse(file, load_config(find_packaged("", "simulated")))
     assert "exposure 0.1 s was asked for" in refused.refusal

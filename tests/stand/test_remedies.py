@@ -11,17 +11,17 @@ import pytest
 from thermostand import stand
 from thermostand.foundation import events
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.events import GUARD, KINDS, Alert, EventKind, alert_of, event, guard_rule
+from thermostand.foundation.events import GUARD, KINDS, Alert, EventKind, event, guard_rule, make_alert
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.foundation.repeats import RepeatLimit
+from thermostand.foundation.repeat_limit import RepeatLimit
 from thermostand.stand import gate
-from thermostand.stand.commands.moment import event_line
-from thermostand.stand.commands.remedies import next_command, troubleshooting
-from thermostand.stand.serving.alerts import AlertBook
+from thermostand.stand.commands.remedies import get_next_command, make_troubleshooting_page
+from thermostand.stand.commands.status_snapshot import format_event
+from thermostand.stand.serving.alerts import AlertTracker
 
 ROOT = Path(stand.__file__).parents[1]
-GENERIC = next_command("of a later version", {})
+GENERIC = get_next_command("of a later version", {})
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def lamp():
     yield event(
         "lamp.broken",
         "warning",
-        "{lamp} has gone out after {lit_s:min} min: {said}",
+        "{lamp} has gone out after {lit_s:min} min: {text}",
         "exchange {folder}'s lamp",
         alert=Alert("device_lost", "lamp", "lasting"),
         counts=True,
@@ -51,14 +51,14 @@ def test_a_kind_that_is_added_is_found_everywhere(lamp: EventKind):
     (seen,) = published(lamp.at(5 * NS_PER_S, "no current", lamp="lamp 2", lit_s=720.0))
     said = "lamp 2 has gone out after 12 min: no current"
     assert seen == Event(5 * NS_PER_S, "warning", "lamp.broken", said, {"lamp": "lamp 2", "lit_s": 720.0})
-    assert next_command(seen.kind, seen.data, "/a night") == "exchange '/a night''s lamp"
-    line = event_line({**vars_of(seen), "utc_offset_ns": 0}, "/n")
+    assert get_next_command(seen.kind, seen.data, "/a night") == "exchange '/a night''s lamp"
+    line = format_event({**vars_of(seen), "utc_offset_ns": 0}, "/n")
     assert line == f"warning: 1970-01-01 00:00:05 UTC  {said}; exchange /n's lamp"
-    book = AlertBook("lab", ("device_lost",), 60 * NS_PER_S, 20)
+    book = AlertTracker("lab", ("device_lost",), 60 * NS_PER_S, 20)
     assert book.receive(seen, seen.time_ns) == []
     assert [each.text for each in book.due(65 * NS_PER_S)] == [said]
     assert len(published(*[lamp.at(second, lamp="1", lit_s=1.0) for second in range(50)])) == 50
-    row = next(line for line in troubleshooting().splitlines() if "`lamp.broken`" in line)
+    row = next(line for line in make_troubleshooting_page().splitlines() if "`lamp.broken`" in line)
     assert [cell.strip() for cell in row.strip("|").split(" | ")[1:]] == [
         "warning",
         "{lamp} has gone out after {lit_s:min} min: {said}",
@@ -77,9 +77,9 @@ def test_a_rule_of_the_guard_that_is_added_has_its_row():
         kind = KINDS[GUARD + name]
         trip, warning = (kind.at(0, "85 dB", rule=name, action=action) for action in ("abort", "warn"))
         assert (trip.level, warning.level, trip.text) == ("error", "warning", "85 dB")
-        assert (alert_of(trip), alert_of(warning)) == (Alert("trip", "guard"), None)
-        assert next_command(warning.kind, warning.data) == "oil it"
-        assert "| `guard.too_loud` that only warns | warning | the fan | oil it |" in troubleshooting()
+        assert (make_alert(trip), make_alert(warning)) == (Alert("trip", "guard"), None)
+        assert get_next_command(warning.kind, warning.data) == "oil it"
+        assert "| `guard.too_loud` that only warns | warning | the fan | oil it |" in make_troubleshooting_page()
     finally:
         del KINDS[GUARD + name]
 
@@ -101,8 +101,8 @@ def test_a_name_is_taken_once():
 @pytest.mark.parametrize("kind", [row for row in KINDS.values() if not row.startswith(GUARD)])
 def test_each_warning_and_error_has_advice_of_its_own(kind: EventKind):
     for case in kind.cases:
-        if kind.level_of(case) != "info":
-            advice = next_command(kind, {"status": "stopped", **case}, "/data/a night")
+        if kind.get_level(case) != "info":
+            advice = get_next_command(kind, {"status": "stopped", **case}, "/data/a night")
             assert advice != GENERIC
             assert "{" not in advice
             assert "DIR" not in advice

@@ -2,11 +2,11 @@
 
 import pytest
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.events import DEVICE_BACK, DEVICE_LOST, SENSOR_BELIEVED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
-from thermostand.foundation.repeats import RepeatLimit
+from thermostand.foundation.repeat_limit import RepeatLimit
 
 
 def published(kind: str, every_s: float, count: int, data: dict[str, object] | None = None) -> list[Event]:
@@ -14,7 +14,7 @@ def published(kind: str, every_s: float, count: int, data: dict[str, object] | N
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     for number in range(count):
         text = f"relays.heater_enable is off {number * 0.1:.1f} s before its time"
-        hub.publish(Event(seconds_ns(number * every_s), "warning", kind, text, data or {}))
+        hub.publish(Event(to_ns(number * every_s), "warning", kind, text, data or {}))
     return events
 
 
@@ -50,7 +50,7 @@ def test_a_state_that_comes_and_goes_is_told_six_times_an_hour_at_most_of_each_d
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     for number in range(int(30000 / every_s)):
         for device in ("flap", "linear"):
-            now_ns = seconds_ns(number * every_s)
+            now_ns = to_ns(number * every_s)
             hub.publish(Batch(device, now_ns, ()))
             row = DEVICE_BACK.at(now_ns, device=device, lost_s=1.0)
             hub.publish(row if number % 2 else DEVICE_LOST.at(now_ns, f"{device}: {number}", device=device))
@@ -66,7 +66,7 @@ def test_a_sensor_that_flickers_is_not_believed_again_without_end():
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     for second in range(3600):
         data = {"channels": ["thermometers.air"], "value_degC": 0.1 * second, "doubted_s": 1.0}
-        hub.publish(SENSOR_BELIEVED.at(seconds_ns(second), "outside", **data))
+        hub.publish(SENSOR_BELIEVED.at(to_ns(second), "outside", **data))
     assert len(events) == 5
     assert events[-1].data["repeated"] == 1199
 
@@ -78,12 +78,12 @@ def test_a_state_that_lasts_is_never_without_its_begin_nor_its_end():
     for second in range(10000):
         was, is_lost = is_lost, second % 10 < 5 if second < 3000 else second < 6000
         if is_lost and not was:
-            hub.publish(DEVICE_LOST.at(seconds_ns(second), "no answer", device="flap"))
+            hub.publish(DEVICE_LOST.at(to_ns(second), "no answer", device="flap"))
         if was and not is_lost:
-            hub.publish(DEVICE_BACK.at(seconds_ns(second), device="flap", lost_s=1.0))
-        hub.publish(Batch("flap", seconds_ns(second), ()))
+            hub.publish(DEVICE_BACK.at(to_ns(second), device="flap", lost_s=1.0))
+        hub.publish(Batch("flap", to_ns(second), ()))
     assert [event.kind for event in events] == 3 * ["device_lost", "device_back"]
-    assert (events[-2].time_ns, events[-1].time_ns) == (seconds_ns(20), seconds_ns(6000))
+    assert (events[-2].time_ns, events[-1].time_ns) == (to_ns(20), to_ns(6000))
     assert events[-1].data["repeated"] == 298
 
 

@@ -14,17 +14,17 @@ from pathlib import Path
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
-from tests.addresses import free_port
-from tests.stand.a_desk import ADesk, served
-from tests.stand.secop_desk import SecopDesk
+from tests.addresses import find_free_port
+from tests.stand.fake_service import FakeService, serve_fake
+from tests.stand.secop_service import SecopService
 from tests.stand.secop_talk import talking
 from tests.stand.test_interface_access import LOOKS, PROXIED, TOKEN, ask
 from thermostand.foundation.items import Event
-from thermostand.stand.commands.serve_cli import Reloading
+from thermostand.stand.commands.serve_cli import TokenReloader
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from thermostand.stand.serving.api.access import COOKIE, STOP_PATH, TokenBook
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.secop.door import door_at
+from thermostand.stand.serving.api.access import COOKIE, STOP_PATH, TokenStore
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.secop.listener import make_secop_listener
 
 OTHER = "another-token-of-rose-that-is-new"
 PAUSE = "/api/v1/run/pause"
@@ -34,7 +34,7 @@ PAUSE = "/api/v1/run/pause"
 class Stand:
     """A desk behind a TCP port, and the file of its tokens: rose may order, wall may look."""
 
-    desk: ADesk
+    desk: FakeService
     port: int
     file: Path
     told: list[Event]
@@ -76,12 +76,12 @@ class Stand:
 
 @asynccontextmanager
 async def tokened(folder: Path) -> AsyncGenerator[Stand]:
-    file, told, port = folder / "tokens.yaml", list[Event](), free_port()
+    file, told, port = folder / "tokens.yaml", list[Event](), find_free_port()
     write_tokens(file, TokenFile(tokens={"rose": TOKEN}, read_only={"wall": LOOKS}))
-    book, desk = TokenBook(load_tokens(file)), ADesk()
+    book, desk = TokenStore(load_tokens(file)), FakeService()
     before = signal.getsignal(signal.SIGHUP)
-    async with served(desk, folder / "night", Interface(folder, port=port, tokens=book)):
-        Reloading(file, book, desk.clock.now_ns, told.append).begin()
+    async with serve_fake(desk, folder / "night", Interface(folder, port=port, tokens=book)):
+        TokenReloader(file, book, desk.clock.now_ns, told.append).begin()
         yield Stand(desk, port, file, told)
         asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
     signal.signal(signal.SIGHUP, before)
@@ -93,7 +93,7 @@ async def leaves(viewer: ClientConnection) -> tuple[int | None, str | None]:
     return viewer.close_code, viewer.close_reason
 
 
-async def stays(viewer: ClientConnection, desk: ADesk) -> bool:
+async def stays(viewer: ClientConnection, desk: FakeService) -> bool:
     """It is told what happens from now on."""
     desk.tell("a sign")
     async with asyncio.timeout(20):
@@ -168,12 +168,12 @@ async def test_a_file_that_cannot_be_used_leaves_the_tokens_as_they_were(tmp_pat
         assert await stand.ask("POST", PAUSE, TOKEN) == 200
 
 
-@pytest.mark.parametrize("tokens", [TokenBook(TokenFile(tokens={"rose": TOKEN})), TokenBook()])
-async def test_this_machine_may_be_trusted_to_look_only_by_secop_too(tmp_path: Path, tokens: TokenBook):
-    desk, port, secop = SecopDesk(), free_port(), free_port()
-    doors = (door_at(secop, read_only=True),)
+@pytest.mark.parametrize("tokens", [TokenStore(TokenFile(tokens={"rose": TOKEN})), TokenStore()])
+async def test_this_machine_may_be_trusted_to_look_only_by_secop_too(tmp_path: Path, tokens: TokenStore):
+    desk, port, secop = SecopService(), find_free_port(), find_free_port()
+    doors = (make_secop_listener(secop, read_only=True),)
     interface = Interface(tmp_path, port=port, tokens=tokens, trusts_loopback="read-only", doors=doors)
-    async with served(desk, tmp_path / "night", interface), talking(secop) as talk:
+    async with serve_fake(desk, tmp_path / "night", interface), talking(secop) as talk:
         statuses = [(await asyncio.to_thread(ask, port, *asked))[0] for asked in (("GET", "/metrics"), ("POST", PAUSE))]
         assert statuses == [200, 403]
         described = (await talk.asked("describe"))[2]["modules"]
@@ -189,13 +189,13 @@ ON_A_TERMINAL = """
 import asyncio, os, signal, sys
 os.setsid()
 terminal = os.open(sys.argv[1], os.O_RDWR)  # it is the session's from now on
-from thermostand.stand.commands.serve_cli import Reloading
-from thermostand.stand.serving.api.access import TokenBook
+from thermostand.stand.commands.serve_cli import TokenReloader
+from thermostand.stand.serving.api.access import TokenStore
 
 async def main():
     ended = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, ended.set)
-    Reloading(None, TokenBook(), lambda: 0, lambda event: print(event.kind, flush=True)).begin()
+    TokenReloader(None, TokenStore(), lambda: 0, lambda event: print(event.kind, flush=True)).begin()
     os.kill(os.getpid(), signal.SIGHUP)
     await ended.wait()
     print("ended", flush=True)

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.writing.notices import SpaceWatch
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import OPERATOR
-from thermostand.stand.guarding.rules import Announcements, natures, watches
+from thermostand.stand.guarding.rules import Announcements, make_channel_models, make_watches
 
 
 class Table:
@@ -22,7 +22,7 @@ class Table:
     def __init__(self) -> None:
         self.hub, self.announced = Hub(), Announcements()
         self.hub.subscribe(self.announced.receive)
-        self.watches = watches(load_config(packaged("", "simulated")), self.announced)
+        self.watches = make_watches(load_config(find_packaged("", "simulated")), self.announced)
         self.values = {
             "regulator.pv": 24.0,
             "regulator.running": 1.0,
@@ -35,7 +35,7 @@ class Table:
 
     def look(self, time_s: float, **changed: float) -> list[Fault]:
         """All read again, with a little noise, then every rule asked."""
-        time_ns = seconds_ns(time_s)
+        time_ns = to_ns(time_s)
         values = self.values | {name.replace("_", ".", 1): value for name, value in changed.items()}
         noise = {"thermometers.air", "thermometers.granite_inside"}
         for channel, value in values.items():
@@ -125,9 +125,9 @@ def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_pat
 
 
 def test_what_no_probe_and_no_camera_can_be_is_no_measurement():
-    config = load_config(packaged("", "simulated"))
+    config = load_config(find_packaged("", "simulated"))
     lowest, highest = config.limits.chamber_degC
-    known = natures(config)
+    known = make_channel_models(config)
     for channel in ("regulator.pv", "camera.temperature"):
         low, high = known[channel].range_degC
         assert -100.0 < low < lowest

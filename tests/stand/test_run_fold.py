@@ -10,7 +10,14 @@ from tests.journals import lines_with, read_lines
 from tests.stand.test_run_table import ID, PLAN, SOAK, S
 from thermostand.experiments.steps import Soak
 from thermostand.foundation.errors import ConfigError, SessionError
-from thermostand.stand.running.executing.actions import Aim, Earn, Perform, Surroundings, TakeFrame, next_action
+from thermostand.stand.running.executing.actions import (
+    ArmCapture,
+    ContinueSoak,
+    Perform,
+    Surroundings,
+    TakeFrame,
+    choose_next_action,
+)
 from thermostand.stand.running.memory.entries import (
     Again,
     Begun,
@@ -21,6 +28,7 @@ from thermostand.stand.running.memory.entries import (
     Extended,
     Gap,
     Held,
+    JournalEntry,
     Readying,
     Reset,
     Restored,
@@ -29,11 +37,10 @@ from thermostand.stand.running.memory.entries import (
     StepChanged,
     Taken,
     Tripped,
-    Written,
 )
-from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.fold import apply_entry, fold
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.running.resume import folded
+from thermostand.stand.running.resume import fold_entries
 
 ids = st.sampled_from([*ID, "unknown"])
 soak = {"kind": "soak", "parameters": {"duration_s": 5.0}}
@@ -84,25 +91,27 @@ def test_any_entries_make_a_state_that_holds_together(entries):
     assert all(step_id in state.done for step_id in ids[: state.index])
     assert state.index == len(ids) or ids[state.index] not in state.done
     assert state.skipped <= state.done
-    assert 0 <= state.restored <= state.disturbances
-    assert all(state.owed_ns(planned) >= 0 for planned in state.plan)
+    assert 0 <= state.restored <= state.setup_invalidations
+    assert all(state.remaining_ns(planned) >= 0 for planned in state.plan)
     assert state.outage_ns(2000 * S) >= 0
-    next_action(state, Surroundings(2000 * S))
+    choose_next_action(state, Surroundings(2000 * S))
 
 
 @given(runs(), st.integers(0, 30))
 def test_entry_by_entry_is_the_same_as_all_at_once(entries, cut):
     state = fold(PLAN, entries[:cut])
     for entry in entries[cut:]:
-        state = after(state, entry)
+        state = apply_entry(state, entry)
     assert state == fold(PLAN, entries)
 
 
 @given(runs())
 def test_after_a_gap_nothing_is_done_before_the_stand_is_as_it_was(entries):
-    state = after(fold(PLAN, entries), Gap(1900 * S, 2000 * S))
-    assert (state.is_disturbed, state.under_way, state.reasons, state.due_ns) == (True, "", frozenset(), None)
-    assert not isinstance(next_action(state, Surroundings(2000 * S)), Aim | Earn | Perform | TakeFrame)
+    state = apply_entry(fold(PLAN, entries), Gap(1900 * S, 2000 * S))
+    assert (state.is_setup_invalid, state.under_way, state.reasons, state.due_ns) == (True, "", frozenset(), None)
+    assert not isinstance(
+        choose_next_action(state, Surroundings(2000 * S)), ArmCapture | ContinueSoak | Perform | TakeFrame
+    )
 
 
 @given(runs())
@@ -114,7 +123,7 @@ def test_what_is_not_written_is_proved_by_the_recording_or_void_after_a_gap(entr
 
 @given(runs())
 def test_the_lines_of_a_journal_make_the_same_state(entries):
-    written = [Begun(0, "night-1", "0f", {}), *(entry for entry in entries if isinstance(entry, Written))]
+    written = [Begun(0, "night-1", "0f", {}), *(entry for entry in entries if isinstance(entry, JournalEntry))]
     assert fold(PLAN, read_lines(lines_with(written))[0]) == fold(PLAN, written)
 
 
@@ -134,13 +143,13 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
 )
 def test_entries_that_no_run_has_written_are_refused(entry):
     with pytest.raises(SessionError, match="no run has written"):
-        folded(PLAN, read_lines(lines_with([entry]))[0])
+        fold_entries(PLAN, read_lines(lines_with([entry]))[0])
 
 
 @pytest.mark.parametrize("by", [[{}], [{"kind": "soak", "parameters": 5}], [{"kind": ["soak"], "parameters": {}}]])
 def test_steps_that_are_none_are_refused(by):
     with pytest.raises(ConfigError):
-        folded(PLAN, [Edited(0, 13, by)])
+        fold_entries(PLAN, [Edited(0, 13, by)])
 
 
 @pytest.mark.parametrize(

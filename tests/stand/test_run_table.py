@@ -26,24 +26,24 @@ from thermostand.experiments.steps import (
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.stand.gate import INTERLOCK, OPERATOR
 from thermostand.stand.running.executing.actions import (
-    Aim,
+    ArmCapture,
     Begin,
     Complete,
-    Earn,
+    ContinueSoak,
     Equilibrate,
-    OpenAgain,
     Perform,
+    ReopenFlap,
+    RestartCold,
     Restore,
+    Retake,
     Sleep,
-    StartCold,
     Surroundings,
-    TakeAgain,
     TakeFrame,
     Wait,
-    due_after_ns,
-    next_action,
-    next_due_ns,
-    worth_of_soaks,
+    choose_next_action,
+    compute_due_after_ns,
+    compute_next_due_ns,
+    credit_soaks,
 )
 from thermostand.stand.running.memory.entries import (
     Again,
@@ -64,7 +64,7 @@ from thermostand.stand.running.memory.entries import (
     Taken,
     Tripped,
 )
-from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.fold import apply_entry, fold
 from thermostand.stand.running.memory.state import RunState, SetUp
 
 S = NS_PER_S
@@ -183,17 +183,17 @@ checking         Pe  Wa  Wa  Pe  Pe  Pe  Pe  Wa  Re  Pe  Re  Pe  Re  Pe  Pe  Pe
 complete         --  --  --  --  --  --  --  --  --  --  --  --  --  --  --  --
 """
 CODES = {
-    "Ai": Aim,
+    "Ai": ArmCapture,
     "Be": Begin,
     "Co": Complete,
-    "Ea": Earn,
+    "Ea": ContinueSoak,
     "Eq": Equilibrate,
-    "OA": OpenAgain,
+    "OA": ReopenFlap,
     "Pe": Perform,
     "Re": Restore,
-    "SC": StartCold,
+    "SC": RestartCold,
     "Sl": Sleep,
-    "TA": TakeAgain,
+    "TA": Retake,
     "TF": TakeFrame,
     "Wa": Wait,
     "--": type(None),
@@ -229,7 +229,7 @@ def test_the_table_has_a_row_for_each_state():
 
 @pytest.mark.parametrize(("state", "event", "expected"), CELLS)
 def test_what_is_done_next(state: str, event: str, expected: type):
-    assert type(next_action(*met(state, event))) is expected
+    assert type(choose_next_action(*met(state, event))) is expected
 
 
 def test_nothing_moves_while_something_holds_the_run():
@@ -237,30 +237,32 @@ def test_nothing_moves_while_something_holds_the_run():
     for state in STATES:
         for event, (_, around) in EVENTS.items():
             if around.get("held"):
-                assert isinstance(next_action(*met(state, event)), still)
+                assert isinstance(choose_next_action(*met(state, event)), still)
 
 
 def test_what_is_restored_is_what_the_steps_before_have_set_up():
-    restore = next_action(*met("half soaked", "killed"))
+    restore = choose_next_action(*met("half soaked", "killed"))
     assert restore == Restore(SetUp(30.0, (PLAN[3],), True, False, {"linear": 2.0}))
-    assert next_action(*met("one frame", "killed")) == Restore(SetUp(30.0, (PLAN[3],), True, True, {"linear": 2.0}))
-    assert next_action(*met("camera off", "killed")).set_up.camera_on is False
+    assert choose_next_action(*met("one frame", "killed")) == Restore(
+        SetUp(30.0, (PLAN[3],), True, True, {"linear": 2.0})
+    )
+    assert choose_next_action(*met("camera off", "killed")).set_up.camera_on is False
 
 
 def test_a_warm_up_begins_again_from_the_switch_that_made_it_cold_without_what_the_operator_did():
-    again = next_action(*met("warming up", "killed")).again
+    again = choose_next_action(*met("warming up", "killed")).again
     assert [planned.step_id for planned in again] == [OFF, COOL, ON, WARM]
-    state = after(met("warming up", "killed")[0], Again(0, [OFF, COOL, ON, WARM]))
-    assert (state.index, state.frames, state.is_disturbed, state.under_way) == (7, {}, True, "")
-    assert isinstance(next_action(state, Surroundings(20 * S)), Restore)
+    state = apply_entry(met("warming up", "killed")[0], Again(0, [OFF, COOL, ON, WARM]))
+    assert (state.index, state.frames, state.is_setup_invalid, state.under_way) == (7, {}, True, "")
+    assert isinstance(choose_next_action(state, Surroundings(20 * S)), Restore)
 
 
 def walk(state: RunState, around: dict[str, Any], *entries_and_actions) -> RunState:
     """After each entry, or change of the surroundings, the action named behind it comes next."""
     for given, expected in entries_and_actions:
         around |= given if isinstance(given, dict) else {}
-        state = state if isinstance(given, dict) else after(state, given)
-        assert type(next_action(state, Surroundings(**around))) is expected, given
+        state = state if isinstance(given, dict) else apply_entry(state, given)
+        assert type(choose_next_action(state, Surroundings(**around))) is expected, given
     return state
 
 
@@ -270,11 +272,11 @@ def test_a_capture_that_was_killed_and_stood_for_a_minute_is_taken_again():
         {"now_ns": 90 * S},
         (Gap(20 * S, 81 * S), Restore),
         (Readying(81 * S, True), Restore),
-        (Restored(85 * S, 1), OpenAgain),
+        (Restored(85 * S, 1), ReopenFlap),
         ({"flap_open": True}, Begin),
         (Readying(86 * S, False), Begin),
-        (StepChanged(87 * S, CAPTURE, "started"), Aim),
-        (Due(88 * S, 88 * S), TakeAgain),
+        (StepChanged(87 * S, CAPTURE, "started"), ArmCapture),
+        (Due(88 * S, 88 * S), Retake),
         (Again(90 * S, [CAPTURE]), TakeFrame),
         (StepChanged(90 * S, CAPTURE, "started"), TakeFrame),
         (Taken(91 * S, CAPTURE), TakeFrame),
@@ -282,7 +284,7 @@ def test_a_capture_that_was_killed_and_stood_for_a_minute_is_taken_again():
         ({"now_ns": 98 * S}, TakeFrame),
         (Taken(98 * S, CAPTURE), Complete),
     )
-    assert not state.is_disturbed
+    assert not state.is_setup_invalid
 
 
 def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_holds_the_run():
@@ -290,14 +292,14 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
         fold(PLAN, STATES["all frames"]),
         {"now_ns": 30 * S, "flap_open": True},
         ({"frames_lost": 1, "held": True}, Wait),
-        ({"held": False}, TakeAgain),
+        ({"held": False}, Retake),
         (Again(30 * S, [CAPTURE]), TakeFrame),
         ({"frames_lost": 0}, TakeFrame),
         (StepChanged(30 * S, CAPTURE, "started"), TakeFrame),
         (Taken(31 * S, CAPTURE), TakeFrame),
         (Taken(41 * S, CAPTURE), Complete),
     )
-    assert not state.is_disturbed
+    assert not state.is_setup_invalid
 
 
 def test_a_capture_is_taken_again_three_times_for_lost_frames_also_when_it_is_resumed_meanwhile():
@@ -306,83 +308,83 @@ def test_a_capture_is_taken_again_three_times_for_lost_frames_also_when_it_is_re
     again = [Again(30 * S, [CAPTURE], 1), StepChanged(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
     entries = [*STATES["all frames"], *again, *again, Gap(32 * S, 33 * S), Restored(34 * S, 1)]
     twice = fold(PLAN, [*entries, StepChanged(35 * S, CAPTURE, "started")])
-    assert next_action(twice, around) == TakeAgain(PLAN[5], "the disk has lost 1 of its frames", 1)
-    thrice = after(twice, Again(36 * S, [CAPTURE], 1))
-    assert isinstance(next_action(fold(PLAN, []), around), Begin)
+    assert choose_next_action(twice, around) == Retake(PLAN[5], "the disk has lost 1 of its frames", 1)
+    thrice = apply_entry(twice, Again(36 * S, [CAPTURE], 1))
+    assert isinstance(choose_next_action(fold(PLAN, []), around), Begin)
     for entry in again[1:]:
-        thrice = after(thrice, entry)
-    assert isinstance(next_action(thrice, around), Complete)
-    done = after(thrice, StepChanged(40 * S, CAPTURE, "done"))
-    assert (thrice.taken_again, done.taken_again) == ({CAPTURE: 3}, {})
+        thrice = apply_entry(thrice, entry)
+    assert isinstance(choose_next_action(thrice, around), Complete)
+    done = apply_entry(thrice, StepChanged(40 * S, CAPTURE, "done"))
+    assert (thrice.retakes, done.retakes) == ({CAPTURE: 3}, {})
 
 
 def test_a_warm_up_of_which_the_disk_lost_frames_is_not_taken_again():
     frames = [Taken(0, WARM)] * next(planned.step.frames for planned in PLAN if planned.step_id == WARM)
     state = fold(PLAN, [*begun(WARM), *frames])
-    assert isinstance(next_action(state, Surroundings(20 * S, frames_lost=1)), Complete)
+    assert isinstance(choose_next_action(state, Surroundings(20 * S, frames_lost=1)), Complete)
 
 
 def test_a_frame_is_settled_when_it_is_the_first_after_a_soak_and_no_warm_up():
-    assert next_action(*met("next is due", "nothing")).is_settled
-    assert not next_action(*met("one frame", "nothing")).is_settled
-    assert not next_action(*met("warming up", "nothing")).is_settled
+    assert choose_next_action(*met("next is due", "nothing")).is_settled
+    assert not choose_next_action(*met("one frame", "nothing")).is_settled
+    assert not choose_next_action(*met("warming up", "nothing")).is_settled
 
 
 def test_soaks_are_credited_only_in_the_band_and_when_the_camera_was_on():
     state, set_up = fold(PLAN, STATES["half soaked"]), SetUp(30.0, (PLAN[3],))
     for pv_degC, lost in ((29.1, ()), (31.0, ()), (28.9, (PLAN[3],))):
-        worth = worth_of_soaks(state, set_up, Surroundings(0, pv_degC=pv_degC))
+        worth = credit_soaks(state, set_up, Surroundings(0, pv_degC=pv_degC))
         assert (bool(worth.text), worth.lost) == (True, lost)
-    assert worth_of_soaks(state, set_up, Surroundings(0, pv_degC=math.nan)).lost
-    cold = after(state, Cooled(0))
-    assert worth_of_soaks(cold, set_up, Surroundings(0, pv_degC=30.0)).lost
-    assert not worth_of_soaks(cold, SetUp(30.0, (PLAN[3],), camera_on=False), Surroundings(0, pv_degC=30.0)).lost
-    assert worth_of_soaks(fold(PLAN, begun(SOAK)), set_up, Surroundings(0, pv_degC=20.0)).text == ""
-    assert not after(cold, Restored(0, 1)).is_cold
-    assert after(after(cold, Cooled(0)), Restored(0, 1)).is_cold  # once more meanwhile
+    assert credit_soaks(state, set_up, Surroundings(0, pv_degC=math.nan)).lost
+    cold = apply_entry(state, Cooled(0))
+    assert credit_soaks(cold, set_up, Surroundings(0, pv_degC=30.0)).lost
+    assert not credit_soaks(cold, SetUp(30.0, (PLAN[3],), camera_on=False), Surroundings(0, pv_degC=30.0)).lost
+    assert credit_soaks(fold(PLAN, begun(SOAK)), set_up, Surroundings(0, pv_degC=20.0)).text == ""
+    assert not apply_entry(cold, Restored(0, 1)).is_cold
+    assert apply_entry(apply_entry(cold, Cooled(0)), Restored(0, 1)).is_cold  # once more meanwhile
 
 
 def test_deadlines_are_a_grid_of_which_those_missed_are_skipped():
     around = Surroundings(47 * S, lead_ns=S)
-    assert next_due_ns(None, FIT, around, is_lost=False) == 48 * S
-    assert next_due_ns(20 * S, FIT, around, is_lost=False) == 50 * S
-    assert next_due_ns(50 * S, FIT, around, is_lost=False) == 50 * S
-    assert next_due_ns(50 * S, FIT, around, is_lost=True) == 60 * S
-    assert due_after_ns(20 * S, FIT, 20 * S) == 30 * S
-    assert due_after_ns(20 * S, FIT, 47 * S) == 40 * S  # the latest that has passed
+    assert compute_next_due_ns(None, FIT, around, is_lost=False) == 48 * S
+    assert compute_next_due_ns(20 * S, FIT, around, is_lost=False) == 50 * S
+    assert compute_next_due_ns(50 * S, FIT, around, is_lost=False) == 50 * S
+    assert compute_next_due_ns(50 * S, FIT, around, is_lost=True) == 60 * S
+    assert compute_due_after_ns(20 * S, FIT, 20 * S) == 30 * S
+    assert compute_due_after_ns(20 * S, FIT, 47 * S) == 40 * S  # the latest that has passed
 
 
 def test_a_frame_is_asked_for_its_lead_before_it_is_due():
     state = fold(PLAN, STATES["next is ahead"])
     for now_s, lead_s, expected in ((20, 0, Sleep(30 * S)), (20, 2, Sleep(28 * S)), (27, 2, Sleep(28 * S))):
-        assert next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)) == expected
+        assert choose_next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)) == expected
     for now_s, lead_s in ((28, 2), (30, 0)):
-        assert isinstance(next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)), TakeFrame)
+        assert isinstance(choose_next_action(state, Surroundings(now_s * S, lead_s * S, flap_open=True)), TakeFrame)
 
 
 def test_a_step_that_is_left_out_ends_what_is_under_way_only_when_that_is_it():
     state = fold(PLAN, [*STATES["next is ahead"], Skipped(0, WARM)])
     assert (state.under_way, state.due_ns) == (CAPTURE, 30 * S)
-    state = after(state, Skipped(0, CAPTURE))
+    state = apply_entry(state, Skipped(0, CAPTURE))
     assert (state.under_way, state.due_ns, state.plan[state.index]) == ("", None, PLAN[6])
 
 
 def test_the_end_of_a_step_ends_what_is_under_way_only_when_that_is_it():
     state = fold(PLAN, [*STATES["one was lost"], StepChanged(0, WARM, "done")])
     assert (state.under_way, state.due_ns, state.is_lost) == (CAPTURE, 20 * S, True)
-    state = after(state, StepChanged(0, CAPTURE, "done"))
+    state = apply_entry(state, StepChanged(0, CAPTURE, "done"))
     assert (state.under_way, state.due_ns, state.is_lost) == ("", None, False)
 
 
 def test_a_capture_of_which_a_step_before_is_done_again_is_neither_under_way_nor_has_lost_a_frame():
     before = fold(PLAN, STATES["one was lost"])
-    state = after(before, Again(0, [OPEN, CAPTURE]))
+    state = apply_entry(before, Again(0, [OPEN, CAPTURE]))
     assert (state.under_way, state.due_ns, state.is_lost) == ("", None, False)
-    assert state.disturbances == before.disturbances + 1
+    assert state.setup_invalidations == before.setup_invalidations + 1
     assert state.plan[state.index].step_id == OPEN
-    same = after(before, Again(0, [CAPTURE]))
+    same = apply_entry(before, Again(0, [CAPTURE]))
     assert (same.under_way, same.due_ns, same.is_lost, same.frames) == (CAPTURE, 20 * S, True, {})
-    assert same.disturbances == before.disturbances
+    assert same.setup_invalidations == before.setup_invalidations
 
 
 def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_counts_once():
@@ -398,23 +400,26 @@ def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_count
     assert fold(PLAN, entries).outage_ns(50 * S) == 22 * S
     assert fold(PLAN, entries[:-1]).outage_ns(50 * S) == 40 * S
     assert fold(PLAN, [*entries[:-1], Gap(40 * S, 100 * S)]).outage_ns(120 * S) == 90 * S
-    assert after(fold(PLAN, entries), Taken(60 * S, CAPTURE)).outage_ns(90 * S) == 0
+    assert apply_entry(fold(PLAN, entries), Taken(60 * S, CAPTURE)).outage_ns(90 * S) == 0
 
 
 def test_a_trip_stays_until_it_is_cleared_and_an_end_until_the_run_goes_on():
     state = fold(PLAN, [Tripped(0, "a", "first"), Tripped(0, "b", "second"), Ended(1, "tripped", "aborted")])
     assert (state.tripped, state.ended.status) == ("first", "tripped")
-    assert after(state, Gap(1, 2)).ended is None
-    assert after(state, Reset(2)).tripped == ""
+    assert apply_entry(state, Gap(1, 2)).ended is None
+    assert apply_entry(state, Reset(2)).tripped == ""
 
 
 def test_a_soak_longer_than_its_time_and_one_that_was_lost_owe_what_they_say():
     state = fold(PLAN, STATES["half soaked"])
-    assert state.owed_ns(PLAN[3]) == 150 * S  # it may take twice its time
-    assert after(state, StepChanged(0, SOAK, "done")).owed_ns(PLAN[3]) == 0
-    assert after(after(state, StepChanged(0, SOAK, "done")), Soaked(0, SOAK, 0.0)).owed_ns(PLAN[3]) == 200 * S
+    assert state.remaining_ns(PLAN[3]) == 150 * S  # it may take twice its time
+    assert apply_entry(state, StepChanged(0, SOAK, "done")).remaining_ns(PLAN[3]) == 0
+    assert (
+        apply_entry(apply_entry(state, StepChanged(0, SOAK, "done")), Soaked(0, SOAK, 0.0)).remaining_ns(PLAN[3])
+        == 200 * S
+    )
     settled = next(number_steps([SoakUntilSettled(900.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)]))
-    assert fold([settled], []).owed_ns(settled) == 900 * S
+    assert fold([settled], []).remaining_ns(settled) == 900 * S
 
 
 def test_a_new_set_point_is_another_set_up():

@@ -4,11 +4,11 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.safety import TRY_LIMIT_S, Pending, Safety
 
 
@@ -24,7 +24,7 @@ class Actuator:
 
     async def make_safe(self) -> None:
         self.calls.append(self._clock.now_ns() / 1e9)
-        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self.takes_s))
+        await self._clock.sleep_until(self._clock.now_ns() + to_ns(self.takes_s))
         if self.failure is not None:
             raise self.failure
 
@@ -44,7 +44,7 @@ class Bench:
         self.revoked += 1
 
     async def wait(self, duration_s: float) -> None:
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
 
     def kinds(self) -> list[str]:
         return [event.kind for event in self.events]
@@ -66,7 +66,7 @@ async def test_permissions_are_gone_when_the_demand_returns_and_every_actuator_i
     async with running() as bench:
         bench.safety.demand()
         assert bench.revoked == 1
-        assert await bench.safety.confirmed(10.0)
+        assert await bench.safety.wait_until_confirmed(10.0)
         assert (bench.relays.calls, bench.flap.calls) == ([0.0], [0.0])
         assert bench.kinds() == []
 
@@ -75,7 +75,7 @@ async def test_a_link_that_is_gone_is_tried_until_it_is_back_and_reported_at_gro
     async with running() as bench:
         bench.relays.failure = Unreachable("relays", "no answer")
         bench.safety.demand()
-        confirming = asyncio.create_task(bench.safety.confirmed(600.0))
+        confirming = asyncio.create_task(bench.safety.wait_until_confirmed(600.0))
         await bench.wait(200.0)
         assert not confirming.done()
         assert len(bench.relays.calls) >= 190  # about once a second, each a call and another one at once
@@ -84,7 +84,7 @@ async def test_a_link_that_is_gone_is_tried_until_it_is_back_and_reported_at_gro
         assert bench.events[1].text.startswith("still trying: relays")
         bench.relays.failure = None
         assert await confirming
-        assert bench.clock.now_ns() < seconds_ns(203.0)
+        assert bench.clock.now_ns() < to_ns(203.0)
         assert bench.kinds()[-1] == "confirmed_safe"
         assert bench.safety.unconfirmed == ()
 
@@ -96,11 +96,11 @@ async def test_what_is_not_confirmed_is_known_with_since_when_until_it_is():
         await bench.wait(1.0)
         assert bench.safety.pending == ()
         bench.safety.demand()
-        assert bench.safety.pending == tuple(Pending(name, seconds_ns(1.0), "") for name in ("relays", "flap"))
+        assert bench.safety.pending == tuple(Pending(name, to_ns(1.0), "") for name in ("relays", "flap"))
         await bench.wait(3.0)
         bench.safety.demand()  # once more: it is not safe since the first time
         (relays, flap), failure = bench.safety.pending, "relays did not confirm its safe state: relays: no answer"
-        assert relays == Pending("relays", seconds_ns(1.0), failure)
+        assert relays == Pending("relays", to_ns(1.0), failure)
         assert flap.failure == ""
         await bench.wait(8.0)
         assert bench.safety.pending == (relays,)
@@ -115,8 +115,8 @@ async def test_the_wait_ends_after_its_limit_and_says_what_is_not_safe():
     async with running() as bench:
         bench.relays.failure = Unreachable("relays", "no answer")
         bench.safety.demand()
-        assert not await bench.safety.confirmed(600.0)
-        assert bench.clock.now_ns() >= seconds_ns(600.0)
+        assert not await bench.safety.wait_until_confirmed(600.0)
+        assert bench.clock.now_ns() >= to_ns(600.0)
         (unconfirmed,) = bench.safety.unconfirmed
     assert unconfirmed.endswith(": relays: no answer")
 
@@ -126,14 +126,14 @@ async def test_a_second_signal_ends_the_wait_from_a_minute_on():
         await bench.wait(500.0)
         bench.relays.failure = Unreachable("relays", "no answer")
         bench.safety.demand()
-        confirming = asyncio.create_task(bench.safety.confirmed(600.0))
+        confirming = asyncio.create_task(bench.safety.wait_until_confirmed(600.0))
         await bench.wait(59.0)
         assert not bench.safety.give_up()
         await bench.wait(2.0)
         assert not confirming.done()
         assert bench.safety.give_up()
         assert not await confirming
-        assert bench.clock.now_ns() < seconds_ns(563.0)
+        assert bench.clock.now_ns() < to_ns(563.0)
 
 
 async def test_a_demand_is_met_by_a_call_that_begins_after_it():
@@ -143,7 +143,7 @@ async def test_a_demand_is_met_by_a_call_that_begins_after_it():
         bench.safety.demand()
         await bench.wait(2.0)
         bench.safety.demand()
-        assert await bench.safety.confirmed(60.0)
+        assert await bench.safety.wait_until_confirmed(60.0)
         assert bench.flap.calls == [0.0, 5.0]
 
 
@@ -151,12 +151,12 @@ async def test_two_demands_at_once_are_one():
     async with running() as bench:
         bench.safety.demand()
         bench.safety.demand()
-        assert await bench.safety.confirmed(60.0)
+        assert await bench.safety.wait_until_confirmed(60.0)
         assert bench.flap.calls == [0.0]
 
 
 def test_a_try_that_hangs_is_given_up_before_the_relays_own_time_is_over():
-    assert load_config(packaged("", "simulated")).guard.heater_hold_s > TRY_LIMIT_S
+    assert load_config(find_packaged("", "simulated")).guard.heater_hold_s > TRY_LIMIT_S
 
 
 async def test_one_that_is_slow_keeps_none_of_the_others():
@@ -166,8 +166,8 @@ async def test_one_that_is_slow_keeps_none_of_the_others():
         await bench.wait(0.5)
         assert not bench.safety.is_confirmed
         assert bench.relays.calls == [0.0]
-        await bench.safety.tried()
-        assert bench.clock.now_ns() >= seconds_ns(8.0)
+        await bench.safety.wait_until_tried()
+        assert bench.clock.now_ns() >= to_ns(8.0)
 
 
 async def test_a_jammed_flap_is_tried_once_a_minute():
@@ -183,11 +183,11 @@ async def test_what_an_operator_has_cleared_is_tried_no_more_until_it_is_demande
         bench.flap.failure = DeviceFault("flap", "jammed")
         bench.safety.demand()
         await bench.wait(10.0)
-        bench.safety.forgive()
+        bench.safety.cancel_pending()
         assert bench.safety.is_confirmed
         await bench.wait(200.0)
         assert bench.flap.calls == [0.0]
         bench.flap.failure = None
         bench.safety.demand()
-        assert await bench.safety.confirmed(10.0)
+        assert await bench.safety.wait_until_confirmed(10.0)
         assert bench.flap.calls == [0.0, 210.0]

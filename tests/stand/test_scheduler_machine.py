@@ -25,15 +25,15 @@ from thermostand.experiments.steps import (
     StopChamber,
     number_steps,
 )
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.errors import StandTripped
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.journal_lines import lines_of
+from thermostand.recording.format.journal_lines import parse_lines
 from thermostand.stand.fault import Fault
 from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K
-from thermostand.stand.running.memory.entries import Again, Soaked, StepChanged, decoded
+from thermostand.stand.running.memory.entries import Again, Soaked, StepChanged, decode
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.opening.stop import Interrupted
 
@@ -107,9 +107,9 @@ class RunMachine(RuleBasedStateMachine):
         data = (Path(self.folder.name) / JOURNAL_NAME).read_bytes()
         if not data.startswith(self.read):
             self.read, self.entries = b"", []
-        lines = lines_of(data)
+        lines = parse_lines(data)
         self.read = data[: lines.size_bytes]
-        self.entries = [*self.entries, *map(decoded, lines.sound[len(self.entries) :])]
+        self.entries = [*self.entries, *map(decode, lines.sound[len(self.entries) :])]
         return self.entries
 
     def _frames_that_count(self):
@@ -193,7 +193,7 @@ class RunMachine(RuleBasedStateMachine):
     @lives
     @rule(duration_s=st.sampled_from([3.0, 40.0, 90.0]))
     def camera_is_lost(self, duration_s):
-        self.life.stand.camera_back_ns = self.life.clock.now_ns() + seconds_ns(duration_s)
+        self.life.stand.camera_back_ns = self.life.clock.now_ns() + to_ns(duration_s)
 
     @precondition(lambda self: not self.life.run.done() and STOPPING not in self.life.stand.gate.reasons)
     @rule(unconfirmed=st.booleans())
@@ -243,7 +243,7 @@ class RunMachine(RuleBasedStateMachine):
     @precondition(lambda self: not self._is_complete())
     @rule(downtime_s=st.sampled_from([1.0, 100.0]), pv_degC=st.sampled_from([24.0, 26.0, 30.0]))
     def killed_and_resumed(self, downtime_s, pv_degC):
-        self._live(self.life.kill() + seconds_ns(downtime_s), pv_degC)
+        self._live(self.life.kill() + to_ns(downtime_s), pv_degC)
 
     def _is_complete(self):
         return self.life.run.done() and self.life.run.exception() is None

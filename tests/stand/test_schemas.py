@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.commands.schema_cli import DOCUMENTS as OFFLINE
-from thermostand.foundation.documents import schema_text
+from thermostand.foundation.documents import format_schema
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.commands.config_cli import DOCUMENTS
 
@@ -31,7 +31,7 @@ KINDS = {
 
 
 def validator(kind: str) -> Draft202012Validator:
-    return Draft202012Validator(json.loads(schema_text(ALL[kind])))
+    return Draft202012Validator(json.loads(format_schema(ALL[kind])))
 
 
 def as_json(value: object) -> Any:
@@ -46,7 +46,7 @@ def as_json(value: object) -> Any:
 @pytest.mark.parametrize("kind", ALL)
 def test_the_schemas_are_current(kind: str):
     """When not: stand config schema, compensate schema."""
-    assert (CONFIGS / "schema" / f"{kind}.json").read_text() == schema_text(ALL[kind])
+    assert (CONFIGS / "schema" / f"{kind}.json").read_text() == format_schema(ALL[kind])
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

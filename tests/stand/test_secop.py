@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.stand.secop_desk import JAM, NO, WIRE, SecopDesk, node
+from tests.stand.secop_service import JAM, NO, WIRE, SecopService, node
 from tests.stand.secop_talk import talking
 from thermostand.stand.gate import INTERLOCK
-from thermostand.stand.serving.desk import FaultState, HeatByHand
-from thermostand.stand.serving.secop.secop_lines import SecopRequest, message, parsed
+from thermostand.stand.serving.api_models import FaultState, HeatByHand
+from thermostand.stand.serving.secop.secop_lines import SecopRequest, make_message, parse_request
 
 
 @pytest.mark.parametrize(
@@ -27,19 +27,19 @@ from thermostand.stand.serving.secop.secop_lines import SecopRequest, message, p
     ],
 )
 def test_lines_are_split_at_the_first_two_spaces(line: bytes, request_: SecopRequest):
-    assert parsed(line) == request_
+    assert parse_request(line) == request_
 
 
 def test_a_message_is_one_line_whatever_it_says():
-    assert message("pong", "", [None, {}]) == b"pong  [null, {}]\n"  # the specification's two spaces
-    assert message("active") == b"active\n"
-    assert message("update", "a:value", ["two\nlines", {}]) == b'update a:value ["two\\nlines", {}]\n'
+    assert make_message("pong", "", [None, {}]) == b"pong  [null, {}]\n"  # the specification's two spaces
+    assert make_message("active") == b"active\n"
+    assert make_message("update", "a:value", ["two\nlines", {}]) == b'update a:value ["two\\nlines", {}]\n'
     with pytest.raises(ValueError, match="JSON"):
-        message("update", "a:value", [float("nan"), {}])
+        make_message("update", "a:value", [float("nan"), {}])
 
 
 async def test_identification_description_and_heartbeat(tmp_path: Path):
-    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+    async with node(SecopService(), tmp_path) as port, talking(port) as talk:
         assert await talk.ask("*IDN?") == "ISSE&SINE2020,SECoP,V2019-09-16,v1.0"
         action, dot, described = await talk.asked("describe")
         assert (action, dot, described["equipment_id"]) == ("describing", ".", "thermostand.a-stand")
@@ -68,7 +68,7 @@ async def test_identification_description_and_heartbeat(tmp_path: Path):
 
 
 async def test_what_is_read_has_its_time_and_what_is_no_measurement_is_an_error(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     read_s = desk.hub.readings["thermometers.air"].time_ns / 1e9
     async with node(desk, tmp_path) as port, talking(port) as talk:
         action, specifier, (value, qualifiers) = await talk.asked("read thermometers_air:value")
@@ -83,7 +83,7 @@ async def test_what_is_read_has_its_time_and_what_is_no_measurement_is_an_error(
 
 
 async def test_an_active_client_gets_everything_and_then_what_changes(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert await talk.ask("activate") == "active"
         described = (await talk.asked("describe"))[2]["modules"]
@@ -119,7 +119,7 @@ async def test_an_active_client_gets_everything_and_then_what_changes(tmp_path: 
 
 
 async def test_a_set_point_is_busy_from_before_its_answer_until_the_air_has_arrived(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as talk, talking(port) as other:
         await other.ask("activate chamber")
         assert (await talk.asked("change chamber:target 30.5"))[2][0] == 30.5
@@ -139,7 +139,7 @@ async def test_a_set_point_is_busy_from_before_its_answer_until_the_air_has_arri
 
 
 async def test_a_stage_is_busy_until_it_has_been_read_where_it_is(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     desk.is_slow = True
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("change linear:target 12"))[2][0] == 12.0
@@ -158,14 +158,14 @@ async def test_a_stage_is_busy_until_it_has_been_read_where_it_is(tmp_path: Path
 
 
 async def test_heat_by_hand_is_in_the_status_of_the_stand(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     desk.by_hand = HeatByHand(setpoint_degC=40.0, since_ns=0)
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("read run:status"))[2][0] == [100, "heat by hand, set-point 40 degC"]
 
 
 async def test_stop_and_what_concerns_runs(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     desk.phase = "running"
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("read run"))[2][0] == 1
@@ -207,7 +207,7 @@ async def test_stop_and_what_concerns_runs(tmp_path: Path):
     ],
 )
 async def test_what_is_wrong_has_its_class_and_a_sentence(tmp_path: Path, line: str, error: str):
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as talk:
         await talk.ask("*IDN?")
         action, _, (found, text, _) = await talk.asked(line)
@@ -222,14 +222,14 @@ async def test_what_is_wrong_has_its_class_and_a_sentence(tmp_path: Path, line: 
     [(WIRE, "CommunicationFailed"), (JAM, "HardwareError"), (NO, "Impossible"), (KeyError("x"), "Impossible")],
 )
 async def test_what_a_device_says_has_its_class(tmp_path: Path, failure: Exception, error: str):
-    desk = SecopDesk()
+    desk = SecopService()
     desk.fails = failure
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("change linear:target 3"))[2][:2] == [error, str(failure)]
 
 
 async def test_a_run_and_a_trip_refuse_orders_with_classes_of_their_own(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     desk.phase = "running"
     async with node(desk, tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("change linear:target 3"))[2][0] == "IsBusy"
@@ -247,5 +247,5 @@ async def test_a_run_and_a_trip_refuse_orders_with_classes_of_their_own(tmp_path
 
 async def test_a_control_loop_that_hangs_is_an_error_and_no_old_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("thermostand.stand.serving.secop.node._OLD_S", -1.0)
-    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+    async with node(SecopService(), tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("read chamber"))[2][0] == "CommunicationFailed"

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.stand.secop_desk import SecopDesk, node
+from tests.stand.secop_service import SecopService, node
 from tests.stand.secop_talk import LIMIT_S, talking
 from tests.stand.test_interface_access import EVIL, PROXIED, TOKEN
-from thermostand.stand.serving.secop import door
+from thermostand.stand.serving.secop import listener
 from thermostand.stand.serving.secop.secop_lines import LINE_LIMIT_BYTES
 
 
@@ -28,7 +28,7 @@ from thermostand.stand.serving.secop.secop_lines import LINE_LIMIT_BYTES
 )
 async def test_who_was_made_to_speak_here_orders_nothing(tmp_path: Path, head: str):
     """A page of another site can send this port what it likes, but not as its first line."""
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as talk:
         talk.say(f"{head}\r\n*IDN?", "do run:stop", "change chamber:target 60", 'do run:_submit "overnight"')
         reported = await talk.end()
@@ -42,7 +42,7 @@ async def test_who_was_made_to_speak_here_orders_nothing(tmp_path: Path, head: s
     "sent", [b"x" * (2 * LINE_LIMIT_BYTES), b"ping 1\n" + b"y" * (2 * LINE_LIMIT_BYTES), b"\xff\xfe\n"]
 )
 async def test_long_lines_and_garbage_end_the_connection(tmp_path: Path, sent: bytes):
-    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+    async with node(SecopService(), tmp_path) as port, talking(port) as talk:
         talk.writer.write(sent)
         assert b"ProtocolError" in (await talk.end() or b"ProtocolError")  # it may be reset before it is read
         async with talking(port) as other:
@@ -50,7 +50,7 @@ async def test_long_lines_and_garbage_end_the_connection(tmp_path: Path, sent: b
 
 
 async def test_requests_are_answered_in_their_order_whole_byte_by_byte_and_beyond_the_most(tmp_path: Path):
-    async with node(SecopDesk(), tmp_path) as port, talking(port) as talk:
+    async with node(SecopService(), tmp_path) as port, talking(port) as talk:
         for byte in b"ping 1\r\nping 2\n":
             talk.writer.write(bytes([byte]))
             await talk.writer.drain()
@@ -64,14 +64,14 @@ async def test_requests_are_answered_in_their_order_whole_byte_by_byte_and_beyon
 
 
 async def test_there_is_room_for_one_more_and_strangers_leave_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as known:
         await known.ask("*IDN?")
-        strangers = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3 * door.MOST_CLIENTS)]
+        strangers = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3 * listener.MOST_CLIENTS)]
         async with talking(port) as last:
             assert (await last.asked("do run:stop"))[0] == "done"
         assert (await known.asked("ping 1"))[0] == "pong"
-        monkeypatch.setattr(door, "_SPEAK_WITHIN_S", 0.0)
+        monkeypatch.setattr(listener, "_SPEAK_WITHIN_S", 0.0)
         async with asyncio.timeout(LIMIT_S):
             assert [await reader.read() for reader, _ in strangers] == [b""] * len(strangers)
         for _, writer in strangers:
@@ -80,8 +80,8 @@ async def test_there_is_room_for_one_more_and_strangers_leave_first(tmp_path: Pa
 
 
 async def test_who_does_not_read_keeps_little_and_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(door, "_SEND_LIMIT_S", 0.3)
-    desk = SecopDesk()
+    monkeypatch.setattr(listener, "_SEND_LIMIT_S", 0.3)
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as talk, talking(port) as other:
         talk.writer.transport.pause_reading()  # type: ignore[attr-defined]
         began_s = time.monotonic()
@@ -94,7 +94,7 @@ async def test_who_does_not_read_keeps_little_and_is_left(tmp_path: Path, monkey
 
 
 async def test_a_flood_of_requests_and_stops_delays_no_stop_of_another(tmp_path: Path):
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as flood, talking(port) as other:
 
         async def pour() -> None:
@@ -141,7 +141,7 @@ async def test_hostile_lines_hurt_nobody(tmp_path: Path):
         "\r",
         "*IDN?",
     ]
-    desk = SecopDesk()
+    desk = SecopService()
     async with node(desk, tmp_path) as port:
         for _ in range(20):
             async with talking(port) as talk:

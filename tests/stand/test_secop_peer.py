@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.stand.secop_desk import SecopDesk, node
+from tests.stand.secop_service import SecopService, node
 
 client = pytest.importorskip("frappy.client")
 errors = pytest.importorskip("frappy.errors")
@@ -38,7 +38,7 @@ class Follower:
                 assert self._changed.wait(end_s - time.monotonic()), "not in time"
 
 
-def converse(port: int, desk: SecopDesk, on_loop: Callable[[Callable[[], object]], object]) -> None:
+def converse(port: int, desk: SecopService, on_loop: Callable[[Callable[[], object]], object]) -> None:
     """In a thread: the peer's client is of threads."""
     follower = Follower(port)
     peer = follower.peer
@@ -75,7 +75,7 @@ def converse(port: int, desk: SecopDesk, on_loop: Callable[[Callable[[], object]
 
 
 async def test_frappys_client_describes_follows_and_operates_the_stand(tmp_path: Path):
-    desk, loop = SecopDesk(), asyncio.get_running_loop()
+    desk, loop = SecopService(), asyncio.get_running_loop()
 
     def on_loop(call: Callable[[], object]) -> None:
         async def called() -> None:

@@ -2,24 +2,24 @@
 
 from typing import Any, cast
 
-from tests.stand.room_devices import Rooms, rooms
+from tests.stand.memory_devices import MemoryStand, run_memory_stand
 from thermostand.drivers.devices.relays import NoRelays
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.errors import Unreachable
-from thermostand.foundation.instants import local_text
-from thermostand.stand.commands.moment import not_yet_safe
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.serving.desk import NotConfirmed, seen_state
+from thermostand.foundation.instants import format_local
+from thermostand.stand.commands.status_snapshot import list_unsafe_parts
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.serving.api_models import NotConfirmed, snapshot_state
 
-BEGIN = f"since {local_text(0)}"
+BEGIN = f"since {format_local(0)}"
 
 
-def seen(here: Rooms):
-    return seen_state(load_config(packaged("", "simulated")), here.stand, here.hub, here.clock)
+def seen(here: MemoryStand):
+    return snapshot_state(load_config(find_packaged("", "simulated")), here.stand, here.hub, here.clock)
 
 
 async def test_after_a_stop_while_a_wire_is_gone_it_is_told_what_is_not_confirmed_until_it_is():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         for part in (here.relays, here.regulator, here.flap):
             here.stand.opened(cast("Any", part))
         here.relays.failures = [Unreachable("relays", "no answer") for _ in range(4)]  # two tries of two calls
@@ -27,19 +27,19 @@ async def test_after_a_stop_while_a_wire_is_gone_it_is_told_what_is_not_confirme
         here.stand.safety.demand()
         first = [NotConfirmed(name=name, since_ns=0) for name in ("relays", "regulator", "flap")]
         assert seen(here).not_confirmed == (first[0].model_copy(update={"timer_s": 15.0}), *first[1:])
-        assert any(line.startswith(f"{BEGIN}: flap ") for line in not_yet_safe(seen(here)))
+        assert any(line.startswith(f"{BEGIN}: flap ") for line in list_unsafe_parts(seen(here)))
         await here.passes(2.5)
         failure = "relays did not confirm its safe state: relays: no answer"
         assert seen(here).not_confirmed == (NotConfirmed(name="relays", since_ns=0, reason=failure, timer_s=15.0),)
-        first_line, timer_line = not_yet_safe(seen(here))
+        first_line, timer_line = list_unsafe_parts(seen(here))
         assert first_line.startswith(f"{BEGIN}: {failure}; ")
         assert "15 s" in timer_line
         await here.passes(6.0)
         assert seen(here).not_confirmed == ()
-        assert list(not_yet_safe(seen(here))) == []
+        assert list(list_unsafe_parts(seen(here))) == []
 
 
 def test_a_stand_without_a_relay_board_has_no_timer_that_ends_heat():
-    here = Rooms()
-    here.stand.chamber.permits._relays = NoRelays("relays", VirtualClock(seconds_ns(0)))
+    here = MemoryStand()
+    here.stand.chamber.permits._relays = NoRelays("relays", VirtualClock(to_ns(0)))
     assert here.stand.chamber.permits.timer_s is None

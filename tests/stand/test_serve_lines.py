@@ -10,17 +10,17 @@ from typer.testing import CliRunner
 
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.foundation.output import Output, outputting
+from thermostand.foundation.output import Output, set_output
 from thermostand.stand.commands import serve_cli
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.commands.serve_cli import _events_shown
+from thermostand.stand.commands.serve_cli import _show_events
 
 LOST = Event(7, "warning", "device_lost", "linear does not answer", {"device": "linear", "lost_s": math.nan})
 
 
 def shown(wanted: Output) -> None:
     hub = Hub()
-    with outputting(wanted), _events_shown(hub):
+    with set_output(wanted), _show_events(hub):
         hub.publish(Event(6, "info", "home_residual", "of no importance"))
         hub.publish(LOST)
 

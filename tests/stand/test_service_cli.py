@@ -9,11 +9,11 @@ from pathlib import Path
 from typer.testing import CliRunner, Result
 
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.latch import SYSTEM_FOLDER
-from thermostand.stand.serving.presence import STANDS_FOLDER
+from thermostand.stand.serving.instances import STANDS_FOLDER
 
-CONFIG = packaged("", "simulated")
+CONFIG = find_packaged("", "simulated")
 
 
 def installed(*options: str) -> Result:

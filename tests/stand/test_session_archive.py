@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.recording.runs import killed, record_run
+from tests.recording.runs import publish_killed, record_run
 from thermostand.stand.commands.sessions.session_commands import app
 
 
@@ -16,7 +16,7 @@ from thermostand.stand.commands.sessions.session_commands import app
 def nights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("nights")
     asyncio.run(record_run(folder / "a"))
-    asyncio.run(record_run(folder / "killed", killed, ""))
+    asyncio.run(record_run(folder / "killed", publish_killed, ""))
     return folder
 
 

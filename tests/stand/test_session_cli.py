@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.recorded import START_NS, half_second, item_key, record
-from tests.stand.session_commands import COUNT, ask, refused
+from tests.recording.full_session import START_NS, item_key, make_half_second, record
+from tests.stand.session_commands import COUNT, ask, read_refusal
 from thermostand.foundation.items import Event
-from thermostand.recording.format.records import frame_places
+from thermostand.recording.format.records import list_frame_places
 from thermostand.recording.reading.session import Session
-from thermostand.stand.commands.sessions.session_table import fitting, lines
+from thermostand.stand.commands.sessions.session_table import fit_columns, format_lines
 
 
 def flip_in_frame(path: Path) -> None:
     data = bytearray(path.read_bytes())
-    data[frame_places(path)[1].chunk.offset + 150] ^= 1
+    data[list_frame_places(path)[1].chunk.offset + 150] ^= 1
     path.write_bytes(data)
 
 
@@ -94,7 +94,7 @@ def test_notes_and_tags_are_listed_and_found(session: Path):
     said = ask("info", session).stdout
     assert "tags          paper" in said
     assert ": door opened" in said
-    assert "one word" in refused("tag", session, "two words")
+    assert "one word" in read_refusal("tag", session, "two words")
     assert ask("verify", session).stdout.endswith("read\n")
 
 
@@ -122,14 +122,14 @@ def test_a_list_of_known_sessions_imports_nothing_that_takes_time(session: Path)
 
 def test_a_folder_without_sessions_and_no_folder(tmp_path: Path):
     assert "no sessions there" in ask("list", tmp_path).stderr
-    assert "no such folder" in refused("list", tmp_path / "nowhere")
+    assert "no such folder" in read_refusal("list", tmp_path / "nowhere")
     (tmp_path / "night.mcap").write_bytes(b"")
-    assert "night.mcap: is a file" in refused("list", tmp_path / "night.mcap")
+    assert "night.mcap: is a file" in read_refusal("list", tmp_path / "night.mcap")
 
 
 def test_a_folder_of_sessions_is_no_session_and_says_which_command_shows_them(session: Path):
     for command in ("info", "verify"):
-        line = refused(command, session.parent)
+        line = read_refusal(command, session.parent)
         assert line.startswith(f"error: {session.parent}: ")
         assert f"`stand session list {session.parent}`" in line
 
@@ -163,7 +163,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
 
 def test_info_tells_what_the_recorder_lost(tmp_path: Path):
     def items(time_ns: int, index: int):
-        yield from half_second(time_ns, index)
+        yield from make_half_second(time_ns, index)
         yield Event(time_ns, "error", "frames_dropped", "frames lost: 1", {"blocks": [[index, index]]})
 
     asyncio.run(record(tmp_path / "s", 3, items=items))
@@ -265,7 +265,7 @@ def test_a_replay_gives_programs_steps_and_events_one_a_line(session: Path):
 
 @pytest.mark.parametrize("speed", ["0", "-1", "fast", "nan", "1e9", ""])
 def test_a_speed_is_a_number_or_max(session: Path, speed: str):
-    assert "from 0.001 to 1000000" in refused("replay", session, f"--speed={speed}")
+    assert "from 0.001 to 1000000" in read_refusal("replay", session, f"--speed={speed}")
 
 
 def test_export_writes_images_and_tables(session: Path, tmp_path: Path):
@@ -287,7 +287,7 @@ def test_export_writes_one_file_for_a_viewer(session: Path, tmp_path: Path):
     out = tmp_path / "night.mcap"
     assert ask("export", session, "--out", out, "--format", "mcap").stdout == f"{out}\n"
     assert out.read_bytes()[:5] == b"\x89MCAP"
-    assert "exists already" in refused("export", session, "--out", out, "--format", "mcap")
+    assert "exists already" in read_refusal("export", session, "--out", out, "--format", "mcap")
 
 
 def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
@@ -319,7 +319,7 @@ def test_trim_takes_times_offsets_and_steps(session: Path, tmp_path: Path):
     ],
 )
 def test_trim_refuses_times_that_are_none(session: Path, tmp_path: Path, times: tuple[str, ...], sentence: str):
-    assert sentence in refused("trim", session, "--out", tmp_path / "part", *times)
+    assert sentence in read_refusal("trim", session, "--out", tmp_path / "part", *times)
     assert not (tmp_path / "part").exists()
 
 
@@ -328,10 +328,10 @@ def test_names_of_sessions_are_whole_however_narrow_the_terminal_is(width: int):
     columns = ("session", "recipe", "start (local)", "duration", "frames", "size", "devices", "run", "files", "note")
     row = ("20260101T180000Z-thermal-cycle", "thermal_cycle", "2026-01-01 19:00:00", "11:02:03", "3914", "1.2 GB")
     table = [(*row, "simulated", "complete", "sound", "a" * 40)]
-    kept, cells, left_out = fitting(columns, table, width)
+    kept, cells, left_out = fit_columns(columns, table, width)
     assert [column for column in columns if column in {*kept, *left_out}] == list(columns)
     assert (kept[0], kept[-2:], cells[0][0]) == ("session", kept[-2:], row[0])
     assert {"run", "files"} <= set(kept)
     assert bool(left_out) is (width < 200)
     if width >= 60:
-        assert max(map(len, lines(kept, cells))) <= width
+        assert max(map(len, format_lines(kept, cells))) <= width

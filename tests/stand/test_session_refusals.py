@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stand.session_commands import ask, refused
+from tests.stand.session_commands import ask, read_refusal
 
 
 @pytest.mark.parametrize("command", ["info", "verify", "replay", "repair"])
@@ -62,7 +62,7 @@ def test_a_command_that_meets_damage_says_that_a_salvage_helps(
 @pytest.mark.parametrize(("command", "option"), USES)
 def test_nothing_is_made_inside_a_session(session: Path, command: str, option: str):
     out = session / "frames" / ".." / "part"
-    assert refused(command, session, option, out).endswith("outside of it")
+    assert read_refusal(command, session, option, out).endswith("outside of it")
     assert not out.exists()
 
 
@@ -70,7 +70,7 @@ def test_nothing_is_made_inside_a_session(session: Path, command: str, option: s
 def test_what_exists_is_not_overwritten(session: Path, tmp_path: Path, arguments: tuple[str, str]):
     command, option = arguments
     (tmp_path / "there").mkdir()
-    assert "there: exists already" in refused(command, session, option, tmp_path / "there")
+    assert "there: exists already" in read_refusal(command, session, option, tmp_path / "there")
 
 
 def test_text_in_a_recording_cannot_write_to_the_terminal(session: Path):

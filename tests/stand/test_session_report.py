@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from thermostand.compensation.observations import TwoEquilibria
+from thermostand.compensation.observations import MixedEquilibria
 from thermostand.compensation.reporting import report
 from thermostand.stand.running.session_report import NotReported, report_session
 
@@ -34,7 +34,7 @@ def test_a_session_across_a_gap_is_reported_by_hand_with_the_option_that_allows_
     tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*_: object) -> None:
-        raise TwoEquilibria("its frames are of two equilibria")
+        raise MixedEquilibria("its frames are of two equilibria")
 
     monkeypatch.setattr(report, "analyse", refused)
     with pytest.raises(NotReported, match=r"night --across-gap -o report\.html` tries again$"):

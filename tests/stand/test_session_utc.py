@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.recording.recorded import START_NS, half_second, record
+from tests.recording.full_session import START_NS, make_half_second, record
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import CLOCK_STEP
 from thermostand.foundation.items import Event
@@ -23,7 +23,7 @@ STEPPED_NS = START_NS + STEPPED * NS_PER_S // 2
 
 
 def stepped(time_ns: int, index: int):
-    yield from half_second(time_ns, index)
+    yield from make_half_second(time_ns, index)
     if index == STEPPED:
         data = {"offset_before_ns": 0, "offset_after_ns": HOUR_NS, "stand_ns": time_ns, "utc_ns": time_ns + HOUR_NS}
         yield Event(time_ns, "warning", CLOCK_STEP, "the system clock was stepped", data)

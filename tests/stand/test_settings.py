@@ -25,7 +25,7 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import Document, parse_document
 from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import assemble
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 
 def modules_of(*packages: ModuleType) -> Iterator[ModuleType]:
@@ -123,7 +123,7 @@ def test_no_dataclass_repeats_settings():
     ids=["packets", "temperature register", "temperature feature"],
 )
 def test_what_a_file_says_of_the_camera_is_what_the_driver_has(changes: dict[str, object]):
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["cameras"]["camera"].update(changes)
     config = parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
     camera = assemble(config, Hub(), WallClock()).devices.cameras["camera"]

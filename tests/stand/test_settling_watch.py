@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.compensation.rendered import Scene, photograph, render
+from tests.compensation.renderer import Scene, photograph, render
 from tests.stand.small_stand import Life
 from thermostand.experiments.steps import SoakUntilSettled, StartChamber, StopChamber, number_steps
 from thermostand.foundation.clock import NS_PER_S

@@ -8,7 +8,7 @@ import yaml
 
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -63,7 +63,7 @@ REFUSED: list[tuple[str, Change, str]] = [
 
 @pytest.mark.parametrize(("stand", "change", "text"), REFUSED)
 def test_what_does_not_fit_is_refused(stand: str, change: Change, text: str):
-    data = yaml.safe_load(packaged("", stand).read_text())
+    data = yaml.safe_load(find_packaged("", stand).read_text())
     change(data)
     with pytest.raises(ConfigError, match=text):
         parse_document(yaml.safe_dump(data), StandConfig, "s.yaml")

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from tests.system.stage_bench import OVERSHOOT, UNIT_PER_STEP, Bench, Kind, running_bench
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Quality
-from thermostand.stand.table import check_home, ready
+from thermostand.stand.table import check_home, prepare_axes
 
 
 @pytest.fixture
@@ -97,10 +97,10 @@ async def test_an_axis_without_scale_is_homed_and_has_no_residual(bench: Bench) 
 async def test_a_stage_whose_motor_went_off_is_approached_again_from_below(bench: Bench) -> None:
     axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
-    await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(120))
+    await bench.clock.sleep_until(bench.clock.now_ns() + to_ns(120))
     assert (await bench.position()).quality is Quality.STALE
     bench.trajectory = []
-    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+    await prepare_axes({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert (await bench.position()).quality is Quality.GOOD
     assert min(bench.trajectory) == pytest.approx(30.0 - OVERSHOOT["linear"], abs=0.01)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
@@ -112,21 +112,21 @@ async def test_a_stage_with_current_in_its_place_is_left_alone(bench: Bench) -> 
     axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     moves = bench.tap.count("move")
-    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+    await prepare_axes({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert (bench.tap.count("move"), notes.events) == (moves, [])
 
 
 async def test_an_axis_the_plan_never_moved_is_left_alone(bench: Bench) -> None:
     notes = IdentityPoint()
     await bench.axis.open()
-    await ready({"linear": bench.axis}, {}, notes.hub, bench.clock)
+    await prepare_axes({"linear": bench.axis}, {}, notes.hub, bench.clock)
     assert (bench.tap.count("move"), notes.events) == (0, [])
 
 
 async def test_a_stage_stopped_on_its_way_is_brought_to_its_place(bench: Bench) -> None:
     axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(20.0)
-    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+    await prepare_axes({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
     assert "stands at 20.0000 mm" in notes.text
 
@@ -135,7 +135,7 @@ async def test_a_stage_that_lost_its_scale_is_homed_before_it_is_approached(benc
     axis, notes = await bench.ready(), IdentityPoint()
     await axis.move_to(30.0)
     bench.fake.power_cycle()
-    await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+    await prepare_axes({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert bench.mechanical == pytest.approx(30.0, abs=1e-4)
     assert (await bench.position()).value == pytest.approx(30.0, abs=1e-9)
     assert "not homed" in notes.text
@@ -146,5 +146,5 @@ async def test_an_alarm_is_not_moved_away(bench: Bench) -> None:
     await axis.move_to(30.0)
     bench.fake.alarm = True
     with pytest.raises(DeviceFault, match="alarm"):
-        await ready({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
+        await prepare_axes({"linear": axis}, {"linear": 30.0}, notes.hub, bench.clock)
     assert notes.events == []

@@ -12,12 +12,12 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from tests import forked
+from tests import fork_server
 from tests.addresses import move_to_free
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.estimating.estimate import price
-from thermostand.stand.estimating.run_estimate import small_disk
+from thermostand.stand.config.stand_config import find_packaged
+from thermostand.stand.estimating.estimate import price_plan
+from thermostand.stand.estimating.run_estimate import explain_small_disk
 from thermostand.stand.running.order import load_order
 
 runner = CliRunner()
@@ -111,7 +111,7 @@ def test_bad_input_ends_with_status_2_and_one_line(arguments: list[str], sentenc
 def test_a_target_that_is_none_is_refused_before_anything_moves(tmp_path: Path):
     target = tmp_path / "target.yaml"
     target.write_text("name: no grid\n")
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump({**data, "target": str(target)}))
     result = runner.invoke(app, ["run", "demo", "--config", str(config), "--out", str(tmp_path / "out")])
@@ -128,12 +128,12 @@ def test_a_usage_error_is_said_in_plain_lines():
 
 
 def test_a_stand_that_does_not_answer_ends_with_status_1_and_leaves_nothing(tmp_path: Path):
-    data = move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), tmp_path)
+    data = move_to_free(yaml.safe_load(find_packaged("", "simulated").read_text()), tmp_path)
     data["bus"]["address"] = f"serial:{tmp_path / 'unplugged'}"
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(data))
     # In a process of its own: asyncio.run and signal handlers belong to a main thread.
-    result = forked.run(
+    result = fork_server.run(
         [
             sys.executable,
             "-m",
@@ -160,11 +160,15 @@ def test_a_disk_that_is_too_small_for_the_plan_is_reported(tmp_path: Path, monke
         monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=size_bytes))
 
     order = load_order("overnight", "simulated")
-    steps = price(order.recipe.plan(), order.config)
+    steps = price_plan(order.recipe.plan(), order.config)
     free(11_000_000_000)
-    assert re.findall(r"[\d.]+ GB", small_disk(tmp_path, steps, order.config)) == ["11.0 GB", "11.1 GB", "2.0 GB"]
+    assert re.findall(r"[\d.]+ GB", explain_small_disk(tmp_path, steps, order.config)) == [
+        "11.0 GB",
+        "11.1 GB",
+        "2.0 GB",
+    ]
     free(13_200_000_000)
-    assert small_disk(tmp_path, steps, order.config) == ""
+    assert explain_small_disk(tmp_path, steps, order.config) == ""
 
 
 def test_ctrl_c_while_the_commands_are_imported_ends_with_a_line(tmp_path: Path):

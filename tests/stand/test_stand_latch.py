@@ -9,10 +9,10 @@ import yaml
 
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import SessionError
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.fault import Fault
-from thermostand.stand.latch import UNREADABLE, WITHIN_S, LatchFile, state_folder
-from thermostand.stand.running.opening.claim import latch_file
+from thermostand.stand.latch import UNREADABLE, WITHIN_S, LatchFile, find_state_folder
+from thermostand.stand.running.opening.stand_lock import find_latch_file
 
 FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC")
 
@@ -28,7 +28,7 @@ def test_what_was_kept_is_found_by_another_program_until_it_is_cleared(path: Pat
     found = LatchFile([path]).read()
     assert found is not None
     assert (found.rule, found.text, found.since_ns) == (FAULT.rule, FAULT.text, 5)
-    assert LatchFile([path]).forget() == ""
+    assert LatchFile([path]).remove() == ""
     assert LatchFile([path]).read() is None
     LatchFile([path]).reset()
 
@@ -114,20 +114,20 @@ def test_a_process_that_has_ended_is_done_without(path: Path):
 
 def test_it_belongs_to_what_heats_and_not_to_a_name_or_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
 
     def of(**changes: object) -> LatchFile:
-        return latch_file(parse_document(yaml.safe_dump(data | changes), StandConfig, "stand.yaml"))
+        return find_latch_file(parse_document(yaml.safe_dump(data | changes), StandConfig, "stand.yaml"))
 
     assert of().keep(FAULT, 5) == ""
     assert of(name="another", recording={"directory": "/elsewhere"}).read() is not None
     assert of(axes={}, cameras={}).read() is not None
     assert of(bus=data["bus"] | {"address": "tcp:127.0.0.1:5999"}).read() is None
-    assert state_folder() == tmp_path / "thermostand"
-    for path in state_folder().iterdir():  # a disk that has forgotten any one of its files
+    assert find_state_folder() == tmp_path / "thermostand"
+    for path in find_state_folder().iterdir():  # a disk that has forgotten any one of its files
         content = path.read_bytes()
         path.unlink()
         assert of().read() is not None
         path.write_bytes(content)
-    assert of().forget() == ""
-    assert list(state_folder().iterdir()) == []
+    assert of().remove() == ""
+    assert list(find_state_folder().iterdir()) == []

@@ -16,17 +16,17 @@ from typing import Any
 import pytest
 from fastapi import APIRouter
 
-from tests.asking import ask
-from tests.nightly import by_night
-from tests.stand.a_desk import ADesk, served
+from tests.daemon_queries import ask
+from tests.nightly import mark_nightly
+from tests.stand.fake_service import FakeService, serve_fake
 from tests.stand.floods import FLOODS, PING, VIEW
 from tests.stand.test_interface_access import book, free_port
 from thermostand.foundation.items import Event
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.stop_thread import StopThread
-from thermostand.stand.serving.client import server_of
-from thermostand.stand.serving.desk import Who
-from thermostand.stand.serving.secop.door import door_at
+from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.client import find_session_server
+from thermostand.stand.serving.secop.listener import make_secop_listener
 
 LIMIT_S = 5.0
 STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n"
@@ -61,9 +61,9 @@ def said(port: int, *parts: bytes) -> bytes:
 
 
 @contextlib.asynccontextmanager
-async def open_stand(folder: Path, **interface: Any) -> AsyncIterator[tuple[ADesk, int]]:
+async def open_stand(folder: Path, **interface: Any) -> AsyncIterator[tuple[FakeService, int]]:
     port = free_port()
-    async with served(ADesk(), folder / "night", Interface(folder, port=port, **interface)) as desk:
+    async with serve_fake(FakeService(), folder / "night", Interface(folder, port=port, **interface)) as desk:
         yield desk, port
 
 
@@ -85,10 +85,10 @@ def flooded(name: str, port: int, secop_port: int) -> Iterator[None]:
 DAILY = ("pings", "answers nobody reads", "half heads", "requests", "bodies in chunks", "uploads to STOP", "stops")
 
 
-@pytest.mark.parametrize("name", [each if each in DAILY else by_night(each) for each in FLOODS])
+@pytest.mark.parametrize("name", [each if each in DAILY else mark_nightly(each) for each in FLOODS])
 async def test_a_stop_is_done_and_answered_whatever_others_do(tmp_path: Path, name: str):
     secop_port = free_port()
-    async with open_stand(tmp_path, doors=(door_at(secop_port),)) as (desk, port):
+    async with open_stand(tmp_path, doors=(make_secop_listener(secop_port),)) as (desk, port):
         flood = flooded(name, port, secop_port)
         await asyncio.to_thread(flood.__enter__)
         with contextlib.ExitStack() as stack:
@@ -182,7 +182,7 @@ async def test_a_viewer_that_speaks_before_it_is_let_in_is_left_without_a_failur
             viewer.sendall(PING * 1000)  # who was let in, and goes on so, has to leave
             while await asyncio.to_thread(viewer.recv, 1 << 16):
                 pass
-        assert (await asyncio.to_thread(server_of(tmp_path / "night").state)).stand == "a stand"
+        assert (await asyncio.to_thread(find_session_server(tmp_path / "night").state)).stand == "a stand"
     assert caplog.records == []
 
 
@@ -190,7 +190,7 @@ async def test_a_viewer_that_speaks_before_it_is_let_in_is_left_without_a_failur
 async def test_a_stop_that_ends_the_daemon_is_answered(tmp_path: Path, way: str):
     ended = asyncio.Event()
 
-    class Ending(ADesk):
+    class Ending(FakeService):
         def stop(self, who: Who) -> str:
             ended.set()
             return super().stop(who)
@@ -200,7 +200,7 @@ async def test_a_stop_that_ends_the_daemon_is_answered(tmp_path: Path, way: str)
     def stop() -> Any:
         return post(port)[1]["verb"] if way == "over TCP" else ask(tmp_path / "night", "stop")["verb"]
 
-    async with served(Ending(), tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(Ending(), tmp_path / "night", Interface(tmp_path, port=port)):
         stopping = asyncio.create_task(asyncio.to_thread(stop))
         await ended.wait()
     assert await stopping == "stop"
@@ -228,4 +228,4 @@ async def test_without_its_thread_stop_is_served_as_everything_else_is(tmp_path:
         assert (await asyncio.wait_for(failures.get(), LIMIT_S)).kind in ("command", "interface_failed")
         assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
         assert (await asyncio.to_thread(post, port))[1]["verb"] == "stop"
-        assert (await asyncio.to_thread(server_of(tmp_path / "night").state)).stand == "a stand"
+        assert (await asyncio.to_thread(find_session_server(tmp_path / "night").state)).stand == "a stand"

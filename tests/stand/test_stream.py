@@ -12,17 +12,17 @@ from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from tests.asking import ask
-from tests.stand.a_desk import ADesk, served
+from tests.daemon_queries import ask
+from tests.stand.fake_service import FakeService, serve_fake
 from tests.stand.test_interface_access import free_port
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.stand.serving.api import stream as streams
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.stream import MOST_VIEWERS, Stream
-from thermostand.stand.serving.client import server_of
-from thermostand.stand.serving.desk import StandState
-from thermostand.stand.serving.presence import living
+from thermostand.stand.serving.api_models import StandState
+from thermostand.stand.serving.client import find_session_server
+from thermostand.stand.serving.instances import list_daemons
 
 
 async def message(viewer: ClientConnection) -> dict[str, Any]:
@@ -37,14 +37,14 @@ async def until(viewer: ClientConnection, kind: str) -> dict[str, Any]:
 
 
 @asynccontextmanager
-async def opened(tmp_path: Path, desk: ADesk) -> AsyncIterator[str]:
+async def opened(tmp_path: Path, desk: FakeService) -> AsyncIterator[str]:
     port = free_port()
-    async with served(desk, tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(desk, tmp_path / "night", Interface(tmp_path, port=port)):
         yield f"ws://127.0.0.1:{port}/api/v1/stream"
 
 
 async def test_a_viewer_gets_the_state_then_what_happens_in_order_with_numbers(tmp_path: Path):
-    desk = ADesk()
+    desk = FakeService()
     async with opened(tmp_path, desk) as url, connect(url) as viewer:
         state = await message(viewer)
         assert state["type"] == "state"
@@ -64,7 +64,7 @@ async def test_a_viewer_gets_the_state_then_what_happens_in_order_with_numbers(t
 
 
 async def test_a_command_is_an_event_with_its_number_and_who_gave_it(tmp_path: Path):
-    desk = ADesk()
+    desk = FakeService()
     async with opened(tmp_path, desk) as url, connect(url) as viewer:
         await message(viewer)
         done = await asyncio.to_thread(ask, tmp_path / "night", "pause")
@@ -86,7 +86,7 @@ async def test_a_client_that_reconnects_gets_what_was_missed_and_learns_what_is_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(streams, "EVENTS", 10)
-    desk = ADesk()
+    desk = FakeService()
     async with opened(tmp_path, desk) as url:
         async with connect(url) as viewer:
             first = (await message(viewer))["seq"]
@@ -113,14 +113,14 @@ async def test_a_client_that_reconnects_gets_what_was_missed_and_learns_what_is_
             assert (await message(viewer))["type"] == "gone"
             assert (await message(viewer))["seq"] == first + 15
         found = await asyncio.to_thread(
-            server_of(tmp_path / "night").request, "GET", f"/api/v1/events?from={first + 20}"
+            find_session_server(tmp_path / "night").request, "GET", f"/api/v1/events?from={first + 20}"
         )
         assert isinstance(found, dict)
         assert (found["gone"], [each["text"] for each in found["events"]]) == (False, ["16", "17", "18", "19"])
 
 
 async def test_a_viewer_who_does_not_read_loses_the_oldest_and_learns_of_it():
-    desk = ADesk()
+    desk = FakeService()
     bridge = Bridge(desk)
     stream = Stream(bridge)
     slow, quick = stream.join(None), stream.join(None)
@@ -141,7 +141,7 @@ async def test_a_viewer_who_does_not_read_loses_the_oldest_and_learns_of_it():
 
 
 async def test_what_nobody_takes_is_dropped_and_counted():
-    desk = ADesk()
+    desk = FakeService()
     bridge = Bridge(desk)
     stream = Stream(bridge)
     for number in range(25_000):
@@ -152,7 +152,7 @@ async def test_what_nobody_takes_is_dropped_and_counted():
 
 
 async def test_a_control_loop_that_hangs_is_said_to_and_orders_time_out():
-    desk = ADesk()
+    desk = FakeService()
     bridge = Bridge(desk)
 
     async def never(_: object) -> None:
@@ -166,7 +166,7 @@ async def test_a_control_loop_that_hangs_is_said_to_and_orders_time_out():
 
 
 async def test_viewers_beyond_the_most_are_refused_and_cost_nobody_a_place(tmp_path: Path):
-    desk = ADesk()
+    desk = FakeService()
     async with opened(tmp_path, desk) as url:
         viewers = [await connect(url) for _ in range(MOST_VIEWERS)]
         with pytest.raises(Exception, match="503"):
@@ -186,9 +186,9 @@ async def test_viewers_beyond_the_most_are_refused_and_cost_nobody_a_place(tmp_p
 
 
 async def test_the_unix_socket_has_the_stream_too(tmp_path: Path):
-    desk, session = ADesk(), tmp_path / "night"
-    async with served(desk, session):
-        (daemon,) = [each for each in living() if each.entry.session == str(session)]
+    desk, session = FakeService(), tmp_path / "night"
+    async with serve_fake(desk, session):
+        (daemon,) = [each for each in list_daemons() if each.entry.session == str(session)]
         async with unix_connect(str(daemon.socket), "ws://localhost/api/v1/stream") as viewer:
             assert (await message(viewer))["data"]["stand"] == "a stand"
 
@@ -207,7 +207,7 @@ async def flooding(viewer: ClientConnection, what: str) -> None:
 
 @pytest.mark.parametrize("sent", ["pings", "texts", "one large text"])
 async def test_a_viewer_that_sends_is_disconnected_and_takes_no_stop_away(tmp_path: Path, sent: str):
-    desk = ADesk()
+    desk = FakeService()
     async with opened(tmp_path, desk) as url, connect(url, max_size=None) as viewer, connect(url) as quiet:
         await until(quiet, "state")
         with pytest.raises(ConnectionClosed):

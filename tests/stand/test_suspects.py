@@ -5,15 +5,15 @@ from collections.abc import Callable
 
 import pytest
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Quality, Reading
 from thermostand.stand.config.chamber_section import ChamberConfig
 from thermostand.stand.fault import Fault
-from thermostand.stand.guarding.drifting import drifting
-from thermostand.stand.guarding.interlocks import disagreement
-from thermostand.stand.guarding.suspects import Witnesses, telling
+from thermostand.stand.guarding.interlocks import limit_disagreement
+from thermostand.stand.guarding.sensor_diagnosis import SensorHistory, name_suspect
+from thermostand.stand.guarding.sensor_drift import limit_sensor_drift
 
 PV, AIR, CEILING, GRANITE, CAMERA = (
     "regulator.pv",
@@ -50,7 +50,7 @@ def found(
     """What a disagreement of 3 K says of air at rest of 30 degC, from which channels move (K by seconds since then);
     others: what heat, cold and set-point are since."""
     settings = {HEAT: 20.0, PERMIT: 1.0, SP: 30.0, COMPRESSOR: 0.0, FLAP: 0.0}
-    witnesses = Witnesses(
+    witnesses = SensorHistory(
         [name for name in (PV, AIR, CEILING) if name in moves],
         {name: lag_s for name, lag_s in LAGS_S.items() if name in moves},
         ChamberConfig(),
@@ -58,9 +58,9 @@ def found(
         (FLAP,),
         (SP, COMPRESSOR),
     )
-    hub, rule = Hub(), telling(disagreement(*pair, 3.0), pair, witnesses)
+    hub, rule = Hub(), name_suspect(limit_disagreement(*pair, 3.0), pair, witnesses)
     for second in range(0, REST_S + FAULT_S, 5):
-        since_s, now_ns = second - REST_S, seconds_ns(second)
+        since_s, now_ns = second - REST_S, to_ns(second)
         values = {name: 30.0 + 20.0 * (name == CAMERA) + move(since_s) for name, move in moves.items()}
         values |= settings | ((others or {}) if since_s >= 0 else {})
         readings = [Reading(name, value, "1", now_ns) for name, value in values.items()]
@@ -150,9 +150,9 @@ def test_a_body_and_a_probe(body: Callable[[float], float], probe: Callable[[flo
     ids=["air", "PV", "no third", "another one"],
 )
 def test_a_drift(drifts: str, thirds: tuple[str, ...], suspect: str | None):
-    hub, rule, fault = Hub(), drifting((AIR, PV), SP, (), 0.1, thirds), None
+    hub, rule, fault = Hub(), limit_sensor_drift((AIR, PV), SP, (), 0.1, thirds), None
     for second in range(0, 12 * 3600, 60):
-        now_ns, drift_K = seconds_ns(second), 0.02 * second / 3600
+        now_ns, drift_K = to_ns(second), 0.02 * second / 3600
         values = {name: 40.0 + drift_K * (name == drifts) for name in (AIR, PV, CEILING)} | {SP: 40.0}
         hub.publish(Batch("stand", now_ns, tuple(Reading(name, value, "1", now_ns) for name, value in values.items())))
         fault = rule(hub, now_ns) or fault

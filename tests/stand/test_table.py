@@ -4,13 +4,13 @@ import asyncio
 
 import pytest
 
-from tests.stand.room_devices import rooms, trip
+from tests.stand.memory_devices import run_memory_stand, trip
 from thermostand.foundation.errors import ConfigError, StandTripped, Unreachable
 from thermostand.stand.fault import Fault
 
 
 async def test_a_stage_without_its_scale_is_homed_first():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         here.linear.has_scale = False
         moving = asyncio.create_task(here.stand.table.move_to("linear", 25.0))
         await here.passes(0.5)
@@ -20,7 +20,7 @@ async def test_a_stage_without_its_scale_is_homed_first():
 
 
 async def test_an_order_to_a_stage_that_is_under_way_takes_its_place_and_nothing_is_left_moving():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         here.linear.has_scale = False
         first = asyncio.create_task(here.stand.table.move_to("linear", 25.0))
         await here.passes(0.5)
@@ -32,7 +32,7 @@ async def test_an_order_to_a_stage_that_is_under_way_takes_its_place_and_nothing
 
 
 async def test_a_fault_while_a_stage_homes_keeps_it_from_the_move():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         here.linear.has_scale = False
         moving = asyncio.create_task(here.stand.table.move_to("linear", 25.0))
         await here.passes(0.5)
@@ -43,13 +43,13 @@ async def test_a_fault_while_a_stage_homes_keeps_it_from_the_move():
 
 
 async def test_an_axis_that_the_stand_has_not_is_named_with_those_it_has():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         with pytest.raises(ConfigError, match=r"axis rotary, .* has linear$"):
             await here.stand.table.move_to("rotary", 1.0)
 
 
 async def test_a_home_check_goes_back_to_where_the_plan_put_the_stage():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await here.stand.table.check_home("linear")
         assert here.calls == ["linear home"]
         await here.stand.table.move_to("linear", 25.0)
@@ -59,7 +59,7 @@ async def test_a_home_check_goes_back_to_where_the_plan_put_the_stage():
 
 
 async def test_before_frames_a_stage_without_current_is_approached_again_and_one_whose_move_failed_is_left():
-    async with rooms() as here:
+    async with run_memory_stand() as here:
         await here.stand.table.move_to("linear", 25.0)
         await here.stand.table.approach_again()
         here.linear.reason = "motor without current"

@@ -10,14 +10,14 @@ from typer.testing import CliRunner, Result
 from thermostand.foundation.errors import ConfigError
 from thermostand.stand.commands.token_cli import app
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 
 TOKEN = "correct-horse-battery-staple"
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["interface"] = {"secrets": str(tmp_path / "private" / "tokens.yaml"), "hosts": ["stand.example"]}
     path = tmp_path / "stand.yaml"
     path.write_text(yaml.safe_dump(data))

@@ -16,30 +16,30 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from tests.addresses import free_port, move_to_free
+from tests.addresses import find_free_port, move_to_free
 from tests.stand.secop_talk import talking
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import StandTripped, Unreachable
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.patience import Patience
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.stand import latch
 from thermostand.stand.assembly import assemble
-from thermostand.stand.commands import reached
+from thermostand.stand.commands import endpoint
 from thermostand.stand.commands.command_table import app as stand
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.fault import Fault, Readings, Watch
 from thermostand.stand.interlock import Interlocked
-from thermostand.stand.latch import UNREADABLE, state_folder
-from thermostand.stand.running.opening.claim import latch_file
+from thermostand.stand.latch import UNREADABLE, find_state_folder
 from thermostand.stand.running.opening.open_stand import OpenStand
+from thermostand.stand.running.opening.stand_lock import find_latch_file
 from thermostand.stand.running.order import load_order
 from thermostand.stand.service.host import Host
 from thermostand.stand.service.run import run_real
 from thermostand.stand.service.stand_service import StandService
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve
-from thermostand.stand.serving.client import Server, server_at, server_of
-from thermostand.stand.serving.secop.door import door_at
+from thermostand.stand.serving.client import Server, find_session_server, make_server
+from thermostand.stand.serving.secop.listener import make_secop_listener
 
 FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC", "hold")
 NOTHING, SECOP_ERROR = "", 400
@@ -48,9 +48,9 @@ NOTHING, SECOP_ERROR = "", 400
 @pytest.fixture
 def config_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A stand of which nothing answers, and that no other test has; nor is there another one on this machine."""
-    found = reached.running_sessions
-    monkeypatch.setattr(reached, "running_sessions", lambda *roots: found(*roots) if roots else [])
-    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    found = endpoint.list_running_sessions
+    monkeypatch.setattr(endpoint, "list_running_sessions", lambda *roots: found(*roots) if roots else [])
+    data: dict[str, Any] = yaml.safe_load(find_packaged("", "simulated").read_text())
     move_to_free(data, tmp_path)["recording"]["directory"] = str(tmp_path / "sessions")
     path = tmp_path / "stand.yaml"
     path.write_text(yaml.safe_dump(data))
@@ -78,11 +78,11 @@ class Surfaces:
 
     async def reset(self) -> None:
         """An operator does."""
-        await asyncio.to_thread(server_of(self.session).order, "reset")
+        await asyncio.to_thread(find_session_server(self.session).order, "reset")
 
     async def rules(self) -> set[str]:
         """Which rule has tripped, by the answers of all surfaces."""
-        state = await asyncio.to_thread(server_of(self.session).state)
+        state = await asyncio.to_thread(find_session_server(self.session).state)
         over_tcp = await asyncio.to_thread(self.http.state)
         shown = await asyncio.to_thread(CliRunner().invoke, stand, ["status", str(self.session), "--json"])
         said: Any = json.loads(shown.output)["stand"]
@@ -116,15 +116,15 @@ class Surfaces:
 @asynccontextmanager
 async def started(config_file: Path, folder: Path) -> AsyncGenerator[Surfaces]:
     """A daemon's stand that finds what is on the disk now."""
-    config, port, secop_port = load_config(config_file), free_port(), free_port()
-    open_stand = OpenStand(assemble(config, Hub(), WallClock()), None, Patience(), is_for_one=False)
-    open_stand.latch.file = latch_file(config)
+    config, port, secop_port = load_config(config_file), find_free_port(), find_free_port()
+    open_stand = OpenStand(assemble(config, Hub(), WallClock()), None, ShutdownDeadline(), is_for_one=False)
+    open_stand.latch.file = find_latch_file(config)
     await open_stand.latch.restore()
     open_stand.prepare()
-    interface = Interface(folder, port=port, doors=(door_at(secop_port),), trusts_loopback=True)
+    interface = Interface(folder, port=port, doors=(make_secop_listener(secop_port),), trusts_loopback=True)
     async with serve(StandService(Host(open_stand)), folder / "night", config.name, interface):
         await asyncio.sleep(0)
-        yield Surfaces(open_stand, folder / "night", server_at(f"http://127.0.0.1:{port}", None), secop_port)
+        yield Surfaces(open_stand, folder / "night", make_server(f"http://127.0.0.1:{port}", None), secop_port)
     await open_stand.assembly.stand.safety.close()
 
 
@@ -140,14 +140,14 @@ async def rules_after(config_file: Path, folder: Path) -> set[str]:
         refused = False
     alone = await asyncio.to_thread(CliRunner().invoke, stand, ["status", "--config", str(config_file)])
     assert alone.exit_code == 1, alone.output
-    found = latch_file(load_config(config_file)).read()
+    found = find_latch_file(load_config(config_file)).read()
     assert ((found is not None), ("has tripped" in alone.output + str(alone.exception))) == (refused, refused)
     async with started(config_file, folder) as surfaces:
         return await surfaces.rules() | {NOTHING if found is None else found.rule}
 
 
 def whole() -> list[Path]:
-    return sorted(state_folder().iterdir())
+    return sorted(find_state_folder().iterdir())
 
 
 def never(_: Path) -> None:
@@ -155,7 +155,7 @@ def never(_: Path) -> None:
 
 
 def tripped(config_file: Path) -> None:
-    latch_file(load_config(config_file)).keep(FAULT, 5)
+    find_latch_file(load_config(config_file)).keep(FAULT, 5)
 
 
 def killed_before_the_rename(config_file: Path) -> None:
@@ -187,7 +187,7 @@ def unreadable(config_file: Path) -> None:
 def of_another_stand(config_file: Path) -> None:
     """What is latched of a neighbour is none of ours."""
     data: dict[str, Any] = yaml.safe_load(config_file.read_text())
-    data["bus"]["address"] = f"tcp:127.0.0.1:{free_port()}"
+    data["bus"]["address"] = f"tcp:127.0.0.1:{find_free_port()}"
     neighbour = config_file.with_name("neighbour.yaml")
     neighbour.write_text(yaml.safe_dump(data))
     tripped(neighbour)
@@ -195,17 +195,17 @@ def of_another_stand(config_file: Path) -> None:
 
 def without_its_folder(config_file: Path) -> None:
     tripped(config_file)
-    shutil.rmtree(state_folder())
+    shutil.rmtree(find_state_folder())
 
 
 def a_folder_that_is_none(config_file: Path) -> None:
-    state_folder().parent.mkdir(parents=True, exist_ok=True)
-    state_folder().write_text("")
+    find_state_folder().parent.mkdir(parents=True, exist_ok=True)
+    find_state_folder().write_text("")
 
 
 def reset(config_file: Path) -> None:
     tripped(config_file)
-    latch_file(load_config(config_file)).reset()
+    find_latch_file(load_config(config_file)).reset()
 
 
 def cleared_and_tripped_again(config_file: Path) -> None:
@@ -258,7 +258,7 @@ async def test_every_surface_follows_a_trip_its_clearing_and_the_next_trip(confi
             assert await surfaces.rules() == {NOTHING}
             assert whole() == []
         surfaces.guard.latch.trip(replace(FAULT, ends_itself=True))
-        surfaces.guard.latch.bar()
+        surfaces.guard.latch.hold_gate()
         assert await surfaces.rules() == {FAULT.rule}
         assert whole() == []  # what ends by itself ends with the program, too
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.recording.recorded import MS, START_NS, record
+from tests.recording.full_session import MS, START_NS, record
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.readings import Frame
+from thermostand.stand.serving.page_data import PageData
 from thermostand.stand.serving.preview import Preview, Setup
-from thermostand.stand.serving.recorded_drift import run_references
+from thermostand.stand.serving.recorded_drift import find_run_references
 from thermostand.stand.serving.shot import FrameShot
-from thermostand.stand.serving.viewing import Viewing
 
 TARGET = (Path(__file__).parents[2] / "configs" / "targets" / "paper-9x6.yaml").read_text("utf-8")
 ROLES = ("warm_up", "reference", "reference", "fit", "calibration", "reference", "fit")
@@ -78,18 +78,18 @@ class InProcess:
 
 
 @asynccontextmanager
-async def viewing(session: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncGenerator[tuple[Viewing, Hub]]:
-    monkeypatch.setattr("thermostand.stand.serving.viewing.Helper", lambda *_: InProcess())
-    monkeypatch.setattr("thermostand.stand.serving.viewing.previewer", lambda _: Looking())
+async def viewing(session: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncGenerator[tuple[PageData, Hub]]:
+    monkeypatch.setattr("thermostand.stand.serving.page_data.Helper", lambda *_: InProcess())
+    monkeypatch.setattr("thermostand.stand.serving.page_data.previewer", lambda _: Looking())
     hub = Hub()
-    found = Viewing(hub, WallClock(), folder, TARGET)
+    found = PageData(hub, WallClock(), folder, TARGET)
     running = asyncio.create_task(found.run(lambda: session))
     yield found, hub
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
 
 
-async def looked_at(found: Viewing, hub: Hub, time_ns: int, role: str):
+async def looked_at(found: PageData, hub: Hub, time_ns: int, role: str):
     for item in moment(time_ns, 9, role):
         hub.publish(item)
     async with asyncio.timeout(60):
@@ -99,7 +99,7 @@ async def looked_at(found: Viewing, hub: Hub, time_ns: int, role: str):
 
 
 def test_the_reference_of_a_session_is_that_of_its_last_series(session: Path):
-    (recalled,) = run_references(session)
+    (recalled,) = find_run_references(session)
     assert recalled.shot.time_ns == START_NS + LAST_REFERENCE * 500 * MS
     assert (recalled.shot.as_reference, recalled.last_role) == (True, "fit")
 

@@ -12,19 +12,19 @@ import pytest
 from rich.console import Console
 from rich.live import Live
 
-from tests.stand.a_desk import ADesk
+from tests.stand.fake_service import FakeService
 from tests.stand.test_control_cli import STATUS
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import RUN_START
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
-from thermostand.stand.commands.control_cli import idle_lines
-from thermostand.stand.commands.live import Foot, PlainLines, RunFollower, panel_lines, plain_line
-from thermostand.stand.commands.moment import ShownMoment, moment_of
-from thermostand.stand.commands.remedies import next_command
-from thermostand.stand.serving.desk import HeatByHand, ReadingState, StandState
+from thermostand.stand.commands.control_cli import format_idle_lines
+from thermostand.stand.commands.live import PlainLines, RunFollower, TerminalPanel, format_line, format_panel
+from thermostand.stand.commands.remedies import get_next_command
+from thermostand.stand.commands.status_snapshot import StatusSnapshot, make_snapshot
+from thermostand.stand.serving.api_models import HeatByHand, ReadingState, StandState
 
 BEGIN_NS = 1_767_290_400 * NS_PER_S  # 2026-01-01 18:00:00 UTC
-MOMENT = ShownMoment(
+MOMENT = StatusSnapshot(
     BEGIN_NS,
     "thermal-cycle on a stand",
     share=0.25,
@@ -56,9 +56,9 @@ class Followed:
     """A run of this process as it is shown, whose service is a desk."""
 
     def __init__(self, folder: Path) -> None:
-        self.moments: list[ShownMoment] = []
+        self.moments: list[StatusSnapshot] = []
         self.lines: list[str] = []
-        self.desk = ADesk(run=STATUS)
+        self.desk = FakeService(run=STATUS)
         self.session = folder / "all nights" / "20260101T180000Z-demo"
         self.following = RunFollower(self.moments.append, self.lines.append, folder / "all nights")
         self.following.watch(self.desk.hub)
@@ -72,7 +72,7 @@ class Followed:
 async def followed(folder: Path, *, desk_answers: bool = True) -> AsyncGenerator[Followed]:
     """Its service answers while inside."""
     found = Followed(folder)
-    front = found.following.front(found.desk, found.session) if desk_answers else nullcontext()
+    front = found.following.follow_service(found.desk, found.session) if desk_answers else nullcontext()
     async with front:
         yield found
 
@@ -115,7 +115,7 @@ async def test_each_warning_says_what_to_type(tmp_path: Path):
     ],
 )
 def test_messages_name_the_next_command(kind: str, data: dict[str, object], command: str):
-    assert command in next_command(kind, data)
+    assert command in get_next_command(kind, data)
 
 
 async def test_a_run_that_has_ended_early_is_resumed_by_the_name_of_its_folder(tmp_path: Path):
@@ -125,19 +125,19 @@ async def test_a_run_that_has_ended_early_is_resumed_by_the_name_of_its_folder(t
 
 
 def test_the_panel_has_a_line_for_each_question():
-    assert panel_lines(MOMENT) == [
+    assert format_panel(MOMENT) == [
         "step 12 of 87: soak for 45 min",
         "set 31.00 °C   air 30.98 °C   camera –",
         "frames 120 of 640   drift 0.123 px   disk 12.3 GB free",
         "━━━━━━╌╌╌╌╌╌╌╌╌╌╌╌╌╌╌╌╌╌ 25%   ends 2026-01-01 19:00 UTC ± 12 min (in 1:00:00)",
     ]
     held = replace(MOMENT, held="held by an operator's pause", frames_lost=3)
-    assert "operator's pause" in panel_lines(held)[0]
-    assert "3 LOST" in panel_lines(held)[2]
+    assert "operator's pause" in format_panel(held)[0]
+    assert "3 LOST" in format_panel(held)[2]
 
 
 def test_the_same_is_one_line_in_a_log():
-    assert plain_line(MOMENT) == (
+    assert format_line(MOMENT) == (
         "run:  25%  2026-01-01 18:00  step 12 of 87: soak for 45 min; set 31.00 °C, air 30.98 °C, camera –; "
         "frames 120 of 640, drift 0.123 px, disk 12.3 GB free; ends 2026-01-01 19:00 UTC ± 12 min (in 1:00:00)"
     )
@@ -158,20 +158,20 @@ def test_a_stand_that_a_daemon_has_is_shown_alike():
         readings={"thermometers.air": air},
         setpoint_degC=24.0,
     )
-    seen = moment_of(state, 0.2)
+    seen = make_snapshot(state, 0.2)
     assert (seen.title, seen.step, seen.steps, seen.frames) == ("thermal-cycle on a stand", 12, 87, 120)
     assert (seen.setpoint_degC, seen.air_degC, seen.camera_degC, seen.drift_px) == (24.0, 23.98, None, 0.2)
     assert (bool(seen.held), seen.end_within_s) == (True, 90.0)
-    idle = moment_of(state.model_copy(update={"run": None, "reasons": (), "queue_halted": "somebody pressed STOP"}))
+    idle = make_snapshot(state.model_copy(update={"run": None, "reasons": (), "queue_halted": "somebody pressed STOP"}))
     assert (idle.doing, idle.held, idle.end_ns) == ("no run", "somebody pressed STOP", None)
     by_hand = HeatByHand(setpoint_degC=40.0, since_ns=BEGIN_NS)
     heated = state.model_copy(update={"run": None, "reasons": (), "phase": "idle", "by_hand": by_hand})
     since = "heated by hand to 40 °C since 2026-01-01 18:00:00 UTC"
-    assert moment_of(heated).doing == f"no run; {since}"
-    assert f"state         {since}" in idle_lines("out", heated)
+    assert make_snapshot(heated).doing == f"no run; {since}"
+    assert f"state         {since}" in format_idle_lines("out", heated)
     hand = by_hand.model_copy(update={"cut_ns": BEGIN_NS + 60 * NS_PER_S})
     cut = heated.model_copy(update={"by_hand": hand, "now_ns": air.time_ns + 61 * NS_PER_S})
-    lines = list(idle_lines("out", cut))
+    lines = list(format_idle_lines("out", cut))
     assert any(line.startswith(f"state         {since}; ") and "18:01:00 UTC" in line for line in lines)
     assert "temperatures  thermometers.air 23.98 degC, 0:01:01 ago" in lines
 
@@ -199,7 +199,7 @@ def test_on_a_terminal_messages_stand_above_the_panel(monkeypatch: pytest.Monkey
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=80, color_system=None)
     with Live(console=console, auto_refresh=False) as live:
-        foot = Foot(live, SetClock())
+        foot = TerminalPanel(live, SetClock())
         foot.show(MOMENT)
         foot.show(replace(MOMENT, doing="too soon after the last"))
         foot.tell("warning: held; `stand continue` ends the pause")

@@ -17,7 +17,7 @@ from thermostand.foundation.events import ALERT_FAILED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.config.alerts_section import AlertsConfig
-from thermostand.stand.serving.alerts import alerting
+from thermostand.stand.serving.alerts import send_alerts
 
 
 def say(text):
@@ -38,7 +38,7 @@ async def main(command):
             os.closerange(30, 100)
             say(item.text)
 
-    async with alerting("lab", config, hub, clock):
+    async with send_alerts("lab", config, hub, clock):
         while not children():
             await asyncio.sleep(0.01)
         say(children()[0])

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager, contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.addresses import usual_camera_address
+from tests.addresses import get_usual_camera_address
 from tests.still_plant import StillPlant
 from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
@@ -26,13 +26,15 @@ def noise(time_ns: int, exposure_s: float, gain_dB: float, rows: int = HEIGHT_px
 
 
 @contextmanager
-def simulated(clock: WallClock | FollowedClock, plant: StillPlant, serial: str = SERIAL) -> Generator[FakeCamera]:
+def run_simulated_camera(
+    clock: WallClock | FollowedClock, plant: StillPlant, serial: str = SERIAL
+) -> Generator[FakeCamera]:
     real_time = isinstance(clock, WallClock)
     fake = FakeCamera(
         plant,
         clock,
         noise,
-        usual_camera_address(),
+        get_usual_camera_address(),
         serial,
         size_px=(WIDTH_px, HEIGHT_px),
         real_time=real_time,
@@ -47,11 +49,11 @@ def simulated(clock: WallClock | FollowedClock, plant: StillPlant, serial: str =
 
 def settings(**changes: object) -> GigeCameraSettings:
     usual: dict[str, object] = {"serial_number": SERIAL, "exposure_s": EXPOSURE_S, "heartbeat_s": 1.5}
-    return GigeCameraSettings.model_validate({"address": usual_camera_address(), **usual, **changes})
+    return GigeCameraSettings.model_validate({"address": get_usual_camera_address(), **usual, **changes})
 
 
 @asynccontextmanager
-async def opened(clock: WallClock | VirtualClock | None = None, **changes: object) -> AsyncGenerator[AravisCamera]:
+async def open_camera(clock: WallClock | VirtualClock | None = None, **changes: object) -> AsyncGenerator[AravisCamera]:
     camera = AravisCamera("camera", settings(**changes), clock or WallClock())
     try:
         await camera.open()
@@ -61,10 +63,10 @@ async def opened(clock: WallClock | VirtualClock | None = None, **changes: objec
 
 
 @asynccontextmanager
-async def virtual(plant: StillPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
+async def run_virtual_camera(plant: StillPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
     """A simulated camera that follows a virtual clock."""
     followed = FollowedClock(START_NS)
-    with simulated(followed, plant) as fake:
+    with run_simulated_camera(followed, plant) as fake:
 
         async def advance(time_ns: int) -> None:
             followed.follow(time_ns)

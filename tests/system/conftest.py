@@ -9,19 +9,19 @@ import pytest
 import yaml
 
 from tests.addresses import move_to_free
-from tests.forked import OWN_HELPERS
+from tests.fork_server import OWN_HELPERS
 from tests.sections import change
 from tests.still_plant import StillPlant
-from tests.system.camera_bench import START_NS, simulated
-from thermostand.drivers.framing.aravis_library import library
+from tests.system.camera_bench import START_NS, run_simulated_camera
+from thermostand.drivers.framing.aravis_library import load_library
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.foundation.clock import WallClock
-from thermostand.foundation.documents import load_document, yaml_data
+from thermostand.foundation.documents import load_document, parse_yaml
 from thermostand.foundation.errors import StandError
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.order import Order
-from thermostand.stand.simulator import Simulator, laboratory_of
+from thermostand.stand.simulator import Simulator, describe_laboratory
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.
@@ -68,7 +68,7 @@ experiments:
 def require_aravis() -> None:
     """Skip where libaravis is missing, but fail in CI."""
     try:
-        library()
+        load_library()
     except StandError as error:
         if os.environ.get("CI") == "true":
             pytest.fail(f"CI must have libaravis: {error}")
@@ -88,7 +88,7 @@ def config_text(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[...,
     frame, polled = (CORNER, getattr(request.module, "POLLED", CALM)) if by_day else (WHOLE_SENSOR, AS_INSTALLED)
 
     def build(wire: str = "tcp", **sections: dict[str, object]) -> str:
-        installed: Any = yaml_data(packaged("", "simulated").read_text(), "simulated")
+        installed: Any = parse_yaml(find_packaged("", "simulated").read_text(), "simulated")
         data = move_to_free(installed, tmp_path)
         if wire == "serial":
             data["bus"]["address"] = f"serial:{tmp_path / 'bus'}"
@@ -111,7 +111,7 @@ def order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Orde
         config_file, recipe_file = tmp_path / "config.yaml", tmp_path / "recipe.yaml"
         config_file.write_text(text)
         recipe_file.write_text(recipe)
-        target = packaged("targets", "paper-9x6").read_text()
+        target = find_packaged("targets", "paper-9x6").read_text()
         config = load_config(config_file)
         return Order(config, load_document(recipe_file, Recipe), text, recipe, target, at_configured_addresses=True)
 
@@ -130,7 +130,7 @@ def simulator() -> Iterator[Callable[[StandConfig, bool], Simulator]]:
     started: list[Simulator] = []
 
     def start(config: StandConfig, virtual: bool) -> Simulator:
-        started.append(Simulator(laboratory_of(config, virtual=virtual, seed=None)))
+        started.append(Simulator(describe_laboratory(config, virtual=virtual, seed=None)))
         return started[-1]
 
     yield start
@@ -141,7 +141,7 @@ def simulator() -> Iterator[Callable[[StandConfig, bool], Simulator]]:
 @pytest.fixture
 def laboratory(tmp_path: Path, config_text: Callable[..., str], simulator: Callable[..., object]) -> Path:
     """The configuration of a simulated stand that answers, with a guard that looks often."""
-    data: Any = yaml_data(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}), "laboratory")
+    data: Any = parse_yaml(config_text(regulator={"poll_s": 0.5}, relays={"poll_s": 0.5}), "laboratory")
     data["relays"]["self_test_s"] = 1.0
     data["cameras"]["camera"] |= {"boot_s": 0.5, "poll_s": 1.0}
     data["flap"]["poll_s"] = 0.5
@@ -163,5 +163,5 @@ def plant() -> StillPlant:
 @pytest.fixture
 def fake(plant: StillPlant) -> Iterator[FakeCamera]:
     """A camera in real time."""
-    with simulated(WallClock(), plant) as camera:
+    with run_simulated_camera(WallClock(), plant) as camera:
         yield camera

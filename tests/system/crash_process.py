@@ -11,16 +11,16 @@ import os
 import sys
 from pathlib import Path
 
-from tests.recording.declared import declared
+from tests.recording.device_declarations import declare_devices
 from tests.system.recording_process import INFO, MESSAGES_PER_ROUND, SETTINGS, batches_of, frame_of
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder
-from thermostand.stand.chamber.compressor import CompressorState, keep
+from thermostand.stand.chamber.compressor import CompressorState, save_state
 from thermostand.stand.running.memory.entries import Begun, Soaked
 from thermostand.stand.running.memory.journal import Journal
-from thermostand.stand.service.queue_file import changing
+from thermostand.stand.service.queue_file import change_queue
 
 SESSION, QUEUE, COMPRESSOR, CONTROL = "session", "runs", "state/compressor.json", "control"
 PAUSE_S = 0.005
@@ -51,7 +51,7 @@ class Marks:
         os.pwrite(self.path, json.dumps(self.counts).encode() + b"\n", 0)
 
 
-async def recorded(recorder, hub, marks):
+async def record_rounds(recorder, hub, marks):
     """One round after the other, each when all of the one before is acknowledged."""
     rounds = 0
     while True:
@@ -66,14 +66,14 @@ async def recorded(recorder, hub, marks):
         await asyncio.sleep(0.001)
 
 
-async def journalled(journal, marks):
+async def write_journal(journal, marks):
     for index in range(1_000_000):
         await journal.write(journal_entry(index))
         marks.note(journal=index + 1)
         await asyncio.sleep(PAUSE_S)
 
 
-async def queued(folder, marks):
+async def fill_queue(folder, marks):
     for index in range(1, 1_000_000):
         await asyncio.to_thread(note_in_queue, folder, index)
         marks.note(queue=index)
@@ -81,13 +81,13 @@ async def queued(folder, marks):
 
 
 def note_in_queue(folder, index):
-    with changing(folder) as draft:
+    with change_queue(folder) as draft:
         draft.set(halted=str(index))
 
 
-async def compressed(path, marks):
+async def write_compressor_state(path, marks):
     for index in range(1, 1_000_000):
-        await asyncio.to_thread(keep, path, compressor_state(index), None)
+        await asyncio.to_thread(save_state, path, compressor_state(index), None)
         marks.note(compressor=index)
         await asyncio.sleep(PAUSE_S)
 
@@ -96,17 +96,17 @@ async def main(folder, marks_path):
     clock, hub, disk = WallClock(), Hub(), DiskProcess()
     marks = Marks(marks_path, folder / CONTROL)
     (folder / QUEUE).mkdir()
-    texts, devices = {"config.yaml": "a: 1\n"}, declared({"thermometers": "thermometers"})
+    texts, devices = {"config.yaml": "a: 1\n"}, declare_devices({"thermometers": "thermometers"})
     recorder = Recorder(folder / SESSION, INFO, texts, devices, hub, clock, settings=SETTINGS, disk=disk)
     await recorder.begin(tuple)
     journal = Journal.create(folder / SESSION)
     journal.start(clock, print, disk)
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(recorder.run())
-        tasks.create_task(recorded(recorder, hub, marks))
-        tasks.create_task(journalled(journal, marks))
-        tasks.create_task(queued(folder / QUEUE, marks))
-        tasks.create_task(compressed(folder / COMPRESSOR, marks))
+        tasks.create_task(record_rounds(recorder, hub, marks))
+        tasks.create_task(write_journal(journal, marks))
+        tasks.create_task(fill_queue(folder / QUEUE, marks))
+        tasks.create_task(write_compressor_state(folder / COMPRESSOR, marks))
 
 
 if __name__ == "__main__":

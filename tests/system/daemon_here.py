@@ -10,7 +10,7 @@ from typing import cast
 from tests.system.test_daemon import LIMIT_S
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.hub import Hub
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.service.daemon import Daemon
 from thermostand.stand.service.serve import serve
 from thermostand.stand.service.stand_service import StandService
@@ -41,7 +41,7 @@ async def served_here(
 ) -> None:
     """Serve that stand until `work` is done, with these doors open; what `work` raises is raised."""
     config = load_config(config_file)
-    texts = {"config.yaml": config_file.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    texts = {"config.yaml": config_file.read_text(), "target.yaml": find_packaged("targets", config.target).read_text()}
 
     @asynccontextmanager
     async def front(desk: StandService, hub: Hub, clock: WallClock) -> AsyncGenerator[None]:

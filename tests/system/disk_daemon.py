@@ -17,8 +17,8 @@ from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.foundation.patience import Patience
 from thermostand.foundation.readings import Frame
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S, Recorder, RecordingSettings, SessionInfo
 from thermostand.stand.running.memory.entries import Begun, Ended, Soaked
@@ -55,7 +55,7 @@ async def main(directory):
     recording = asyncio.create_task(recorder.run())
     log, journal = Logbook(hub, clock, RunState(())), Journal.create(directory)
     await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
-    recorder.beside(journal)
+    recorder.watch_file(journal)
     publishing = asyncio.create_task(publish(hub, clock, journal))
     say(disk.pid)
     while not stopped.is_set():
@@ -64,7 +64,7 @@ async def main(directory):
         say(time.monotonic(), recorder.saved.frames, recorder.saved.telemetry, age_s, recorder.folder_lost)
         await asyncio.sleep(0.02)
     publishing.cancel()
-    patience = Patience()
+    patience = ShutdownDeadline()
     patience.begin()
     try:
         try:

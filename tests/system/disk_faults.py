@@ -47,7 +47,7 @@ def put_back(tree: Tree, folder: Path) -> None:
         path.chmod(0o600)
 
 
-def drawn(before: Sequence[Tree], now: Tree, seed: int, kind: str) -> State | None:
+def draw_state(before: Sequence[Tree], now: Tree, seed: int, kind: str) -> State | None:
     """One state of that kind; None when what was drawn changes nothing."""
     state = KINDS[kind](before, now, random.Random(f"{kind} {seed}"))
     return replace(state, seed=seed) if state is not None and state.hit else None
@@ -97,7 +97,7 @@ def _old(before: Sequence[Tree], now: Tree, name: str, begin: int, end: int, rng
     return data[begin:end].ljust(end - begin, b"\0")
 
 
-def _changed(kind: str, text: str, before: Sequence[Tree], now: Tree, changes: dict[str, bytes]) -> State:
+def _make_changed_state(kind: str, text: str, before: Sequence[Tree], now: Tree, changes: dict[str, bytes]) -> State:
     """A file of one sector that kept its old content is one whose flush was lost."""
     hit = frozenset(name for name, data in changes.items() if data != now[name])
     gone_back = frozenset(name for name in hit if any(tree.get(name) == changes[name] for tree in before))
@@ -108,20 +108,20 @@ def _old_sector(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
     name = _file(now, rng)
     begin, end = _sector(now[name], rng)
     data = _with(now[name], begin, _old(before, now, name, begin, end, rng))
-    return _changed("old sector", f"{name} [{begin}:{end}]", before, now, {name: data})
+    return _make_changed_state("old sector", f"{name} [{begin}:{end}]", before, now, {name: data})
 
 
-def _misdirected(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
+def _misdirect(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
     """Within a file: the sector stands in another place, and its own place keeps what was there."""
     name = _file(now, rng)
     (begin, end), (to, _) = _sector(now[name], rng), _sector(now[name], rng)
     to -= to % (end - begin)
     data = _with(now[name], begin, _old(before, now, name, begin, end, rng))
     data = _with(data, to, now[name][begin:end]) if to != begin else now[name]
-    return _changed("misdirected", f"{name} [{begin}:{end}] to {to}", before, now, {name: data})
+    return _make_changed_state("misdirected", f"{name} [{begin}:{end}] to {to}", before, now, {name: data})
 
 
-def _misdirected_elsewhere(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
+def _misdirect_elsewhere(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
     """Into another file, half of the time one of the same kind, and there in the same place."""
     name = _file(now, rng)
     alike = [other for other in sorted(now) if kind_of(other) == kind_of(name) and other != name]
@@ -130,19 +130,21 @@ def _misdirected_elsewhere(before: Sequence[Tree], now: Tree, rng: random.Random
     to = begin if begin < len(now[target]) else 0
     changes = {target: _with(now[target], to, now[name][begin:end])}
     changes[name] = _with(now[name], begin, _old(before, now, name, begin, end, rng))
-    return _changed("misdirected elsewhere", f"{name} [{begin}:{end}] to {target} {to}", before, now, changes)
+    return _make_changed_state(
+        "misdirected elsewhere", f"{name} [{begin}:{end}] to {target} {to}", before, now, changes
+    )
 
 
-def _flush_lost(before: Sequence[Tree], now: Tree, rng: random.Random) -> State | None:
+def _lose_flush(before: Sequence[Tree], now: Tree, rng: random.Random) -> State | None:
     """A file is as it was before its last flush, all others are as they are now."""
     name = _file(now, rng)
     earlier = _earlier(before, now, name)
     if not earlier:
         return None
-    return _gone_back("flush lost", now, {name: earlier[-1]})
+    return _make_reverted_state("flush lost", now, {name: earlier[-1]})
 
 
-def _name_lost(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
+def _lose_name(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
     """A file that was made or renamed is not there, but under the name it had before."""
     name = _file(now, rng)
     changes: dict[str, bytes | None] = {name: None}
@@ -150,19 +152,19 @@ def _name_lost(before: Sequence[Tree], now: Tree, rng: random.Random) -> State:
         changes[f"{name}.part"] = next(
             (tree[f"{name}.part"] for tree in reversed(before) if f"{name}.part" in tree), None
         )
-    return _gone_back("name lost", now, changes)
+    return _make_reverted_state("name lost", now, changes)
 
 
-def _came_back(before: Sequence[Tree], now: Tree, rng: random.Random) -> State | None:
+def _bring_back(before: Sequence[Tree], now: Tree, rng: random.Random) -> State | None:
     """A file that was removed, or renamed, is there again."""
     gone = {name: data for tree in before for name, data in tree.items() if name not in now}
     if not gone:
         return None
     name = _file(gone, rng)
-    return _gone_back("came back", now, {name: gone[name]})
+    return _make_reverted_state("came back", now, {name: gone[name]})
 
 
-def _gone_back(kind: str, now: Tree, changes: dict[str, bytes | None]) -> State:
+def _make_reverted_state(kind: str, now: Tree, changes: dict[str, bytes | None]) -> State:
     tree = {name: data for name, data in (now | changes).items() if data is not None}
     names = frozenset(name for name, data in changes.items() if data != now.get(name))
     return State(kind, ", ".join(sorted(names)), tree, names, names)
@@ -170,11 +172,11 @@ def _gone_back(kind: str, now: Tree, changes: dict[str, bytes | None]) -> State:
 
 KINDS: dict[str, Callable[[Sequence[Tree], Tree, random.Random], State | None]] = {
     "old sector": _old_sector,
-    "misdirected": _misdirected,
-    "misdirected elsewhere": _misdirected_elsewhere,
-    "flush lost": _flush_lost,
-    "name lost": _name_lost,
-    "came back": _came_back,
+    "misdirected": _misdirect,
+    "misdirected elsewhere": _misdirect_elsewhere,
+    "flush lost": _lose_flush,
+    "name lost": _lose_name,
+    "came back": _bring_back,
 }
 
 
@@ -182,5 +184,5 @@ def states(before: Sequence[Tree], now: Tree, seeds: range) -> Iterator[State]:
     """Of each kind one for each seed, but those that change nothing."""
     for seed in seeds:
         for kind in KINDS:
-            if (state := drawn(before, now, seed, kind)) is not None:
+            if (state := draw_state(before, now, seed, kind)) is not None:
                 yield state

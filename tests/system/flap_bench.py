@@ -12,7 +12,7 @@ from tests.still_plant import StillPlant
 from thermostand.drivers.devices.motion.flap import Flap, FlapSettings
 from thermostand.drivers.sim.motion.flap import MAX_DUTY_FORWARD, FakeFlap
 from thermostand.drivers.sim.usb import ForwardingBackend, Handle, TransferFailed, UsbServer
-from thermostand.foundation.clock import FollowedClock, VirtualClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, VirtualClock, to_ns
 from thermostand.foundation.readings import Quality, Reading
 
 T0 = 1_700_000_000_000_000_000
@@ -100,7 +100,7 @@ class Bench:
         return self.plant.flap_open_at(self.followed.now_ns())
 
     async def wait(self, duration_s: float) -> None:
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
 
     async def after(self, delay_s: float, action: Callable[[], Awaitable[object] | None]) -> None:
         """Do something while something else is going on."""

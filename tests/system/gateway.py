@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from tests.addresses import free_port
+from tests.addresses import find_free_port
 from thermostand.stand.running.order import Order
 
 
@@ -15,7 +15,7 @@ class Gateway:
     between `unplug` and `plug` nobody listens, and no connection lives."""
 
     def __init__(self, behind: int) -> None:
-        self.port = free_port()
+        self.port = find_free_port()
         self.loses: Callable[[bytes], bool] = lambda request: False
         self._behind = behind
         self._sockets: set[socket.socket] = set()

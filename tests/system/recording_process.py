@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.recording.declared import declared
-from tests.recording.declared import form as declared_form
-from tests.recording.stored import stored
+from tests.recording.device_declarations import declare_devices
+from tests.recording.device_declarations import form as declared_form
+from tests.recording.frame_records import make_frame_records
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
@@ -57,7 +57,7 @@ def batches_of(index):
 
 def frame_records(count):
     """What the images of the first rounds are on the disk."""
-    return images_in(record for index in range(count) for record in stored(frame_of(index)))
+    return images_in(record for index in range(count) for record in make_frame_records(frame_of(index)))
 
 
 def images_in(records):
@@ -80,7 +80,7 @@ async def record(directory):
         directory,
         INFO,
         {"config.yaml": "a: 1\n"},
-        declared({"thermometers": "thermometers"}),
+        declare_devices({"thermometers": "thermometers"}),
         hub,
         clock,
         settings=SETTINGS,

@@ -43,12 +43,12 @@ def steps_of(kind: Kind, chamber_seed: int | None, law: Law | None = None, chann
     return asyncio.run(_steps(kind, chamber_seed, law, channel or "thermometers.air"))
 
 
-def tuned_in(chamber_seed: int | None) -> Law:
+def autotune_in(chamber_seed: int | None) -> Law:
     """What autotuning finds there, from a law that suits nothing in particular."""
-    return asyncio.run(_tuned(chamber_seed))
+    return asyncio.run(_autotune(chamber_seed))
 
 
-async def _tuned(chamber_seed: int | None) -> Law:
+async def _autotune(chamber_seed: int | None) -> Law:
     async with _stand("software-regulator", chamber_seed, Law()) as stand:
         regulator = stand.assembly.devices.regulator
         assert isinstance(regulator, SoftwareRegulator)

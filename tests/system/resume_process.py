@@ -13,10 +13,10 @@ from pathlib import Path
 from signal import SIGKILL
 from threading import Timer
 
-from tests import forked
+from tests import fork_server
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.readings import Frame
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import resume, run_virtual
 
 DOWNTIME_S = 45.0
@@ -44,7 +44,7 @@ def main():
     order, place = pickle.loads(sys.stdin.buffer.read())
     if order is None:
         say("resuming")
-        before = interruption(place)
+        before = load_interruption(place)
         say("resumed")
         asyncio.run(resume(before, watch, DOWNTIME_S))
     else:
@@ -55,7 +55,7 @@ class Daemon:
     """A running daemon; the frames at `acknowledged` (ns) are on the disk."""
 
     def __init__(self, order, place: Path):
-        self._process = forked.popen(
+        self._process = fork_server.popen(
             [sys.executable, "-m", "tests.system.resume_process"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         self._process.stdin.write(pickle.dumps((order, place)))

@@ -13,7 +13,7 @@ from thermostand.drivers.framing.ximc import encode
 from thermostand.drivers.sim.motion.ximc import FakeAxis, XimcEngine
 from thermostand.drivers.sim.motion.ximc_table import LINEAR_8MT160_300, ROTARY_8MR151
 from thermostand.drivers.sim.wire import LinkFaults, PtyWire, TcpWire
-from thermostand.foundation.clock import FollowedClock, VirtualClock, seconds_ns
+from thermostand.foundation.clock import FollowedClock, VirtualClock, to_ns
 from thermostand.foundation.readings import Reading
 
 T0 = 1_700_000_000_000_000_000
@@ -109,7 +109,7 @@ class Bench:
 
     async def after(self, delay_s: float, action: Callable[[], Awaitable[object] | None]) -> None:
         """Do something while something else is going on."""
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(delay_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(delay_s))
         if (work := action()) is not None:
             await work
 

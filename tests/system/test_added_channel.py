@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.addresses import free_port
+from tests.addresses import find_free_port
 from tests.installed import install, see_it_everywhere
 from tests.recording.test_export import csv_rows
 from tests.system.test_run import at_step
@@ -23,21 +23,21 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Channel, Reading
 from thermostand.recording.exporting.export import export
-from thermostand.recording.reading.overview import overview
+from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
-from thermostand.stand.assembly import recorded_devices as declared_devices
-from thermostand.stand.commands.sessions.session_text import info_json, info_lines
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.assembly import list_recorded_devices as declared_devices
+from thermostand.stand.commands.sessions.session_text import format_info, make_info_json
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 from thermostand.stand.serving.api.bridge import StateSnapshot
-from thermostand.stand.serving.api.reads import metrics
-from thermostand.stand.serving.desk import seen_state
-from thermostand.stand.serving.recorded_history import session_columns
+from thermostand.stand.serving.api.read_routes import format_metrics
+from thermostand.stand.serving.api_models import snapshot_state
+from thermostand.stand.serving.recorded_history import read_session_columns
 
 MODULE = '''
 """A weather station that answers a line: `?` -> `1013.2 11.5 0.25 3.4`; a value that it has not is `-`."""
@@ -50,7 +50,7 @@ from thermostand.drivers.settings import Identity, Polled
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.addresses import ByteAddress
-from thermostand.foundation.calls import Lane
+from thermostand.foundation.workers import WorkerThread
 from thermostand.foundation.readings import Channel, Reading, bad_reading
 
 CHANNELS = (
@@ -79,7 +79,7 @@ class Station:
         return (await self._lane.call(self._client.query, b"?\\n", whole)).split()
 
     async def open(self):
-        self._lane = self._lane or Lane(self.name, self._clock)
+        self._lane = self._lane or WorkerThread(self.name, self._clock)
         await self._ask()
         self.identity = Identity("Acme", "W1", "7", "")
 
@@ -128,7 +128,7 @@ experiments:
 
 def lab() -> dict[str, object]:
     """In a stand's file."""
-    return {"kind": "station", "address": f"tcp:127.0.0.1:{free_port()}"}
+    return {"kind": "station", "address": f"tcp:127.0.0.1:{find_free_port()}"}
 
 
 VALUES = {"pressure": 1013.2, "dew": 11.5, "ratio": 0.25, "flow": 3.4}
@@ -153,7 +153,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 
 def stand_with(**changes: Any) -> StandConfig:
-    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    data: dict[str, Any] = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["devices"] = {"lab": lab()}
     data["guard"] = {**data.get("guard", {}), **changes}
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
@@ -196,18 +196,18 @@ async def test_it_is_recorded_exported_and_drawn_by_its_own_name_and_unit(tmp_pa
         ("1013.2", "0.25", "good"),
         ("1013.2", "0.25", "bad"),
     }
-    history = session_columns(session.path, 200)
+    history = read_session_columns(session.path, 200)
     assert {channel: history.units[channel] for channel in UNITS} == UNITS
     assert {round(value, 1) for value in history.low["lab.pressure"].tolist() if value == value} == {1013.2}
-    seen = overview(session.path)
-    ranges = {row["channel"]: row for row in cast("list[dict[str, Any]]", info_json(seen)["channels"])}
+    seen = summarise_session(session.path)
+    ranges = {row["channel"]: row for row in cast("list[dict[str, Any]]", make_info_json(seen)["channels"])}
     assert {name: ranges[name]["unit"] for name in UNITS} == UNITS
     assert (ranges["lab.pressure"]["min"], ranges["lab.pressure"]["max"], ranges["lab.rain"]["max"]) == (
         1013.2,
         1013.2,
         None,
     )
-    assert any("lab.flow l/min" in line for line in info_lines(seen))
+    assert any("lab.flow l/min" in line for line in format_info(seen))
     checked = verify(session.path)
     assert checked.is_sound
     assert [each.text for each in checked.findings if "though it was declared" in each.text] == []
@@ -220,7 +220,7 @@ async def test_it_is_among_the_metrics_with_its_unit():
     declared = declared_devices(config)["lab"].channels
     readings = (Reading(f"lab.{each.name}", VALUES.get(each.name, 0.5), each.unit, 0) for each in declared)
     hub.publish(Batch("lab", 0, tuple(readings)))
-    text = metrics(StateSnapshot(seen_state(config, stand, hub, clock), 0.0), 0, 0)
+    text = format_metrics(StateSnapshot(snapshot_state(config, stand, hub, clock), 0.0), 0, 0)
     for channel, unit in UNITS.items():
         assert f'thermostand_reading{{channel="{channel}",unit="{unit}"}} ' in text
     await stand.safety.close()
@@ -235,13 +235,13 @@ def test_a_unit_that_has_changed_when_a_run_is_resumed_is_an_event_and_its_readi
         asyncio.run(run_virtual(ordered, tmp_path / "out", None, stop))
     (directory,) = (tmp_path / "out").iterdir()
     station('"hPa"', '"mbar"')
-    asyncio.run(resume(interruption(directory), lambda hub: None))
+    asyncio.run(resume(load_interruption(directory), lambda hub: None))
     session = Session.open(directory)
     (differs,) = [each.data for each in session.events() if each.kind == "stand_differs"]
     assert (differs["path"], differs["session"], differs["stand"]) == ("the unit of lab.pressure", "hPa", "mbar")
     pressures = {channel: unit for channel, unit in session.units().items() if channel.startswith("lab.pressure")}
     assert pressures == {"lab.pressure": "hPa", "lab.pressure (mbar)": "mbar"}
-    ranges = {each.channel: each.count for each in overview(directory).channels}
+    ranges = {each.channel: each.count for each in summarise_session(directory).channels}
     for channel in pressures:
         assert 0 < len(session.readings(channel)[0]) == ranges[channel]
     assert verify(directory).is_sound
@@ -325,7 +325,7 @@ def test_names_that_cannot_be_found_again_are_refused(station: Callable[[str, st
 
 @pytest.mark.usefixtures("station")
 def test_two_devices_of_one_name_are_refused():
-    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    data: dict[str, Any] = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["devices"] = {"camera": lab()}
     with pytest.raises(ConfigError, match="the name camera"):
         parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")

@@ -9,24 +9,24 @@ from typing import Any, cast
 import pytest
 import yaml
 
-from tests.addresses import free_port
+from tests.addresses import find_free_port
 from tests.installed import install, see_it_everywhere
-from thermostand.drivers.devices.checking import Finding
-from thermostand.drivers.devices.kinds import built_in
+from thermostand.drivers.devices.device_check import Finding
+from thermostand.drivers.devices.kinds import load_built_in_kinds
 from thermostand.drivers.sim.fakes import FAKES, fake_of
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import assemble, device_kinds
+from thermostand.stand.assembly import assemble, list_device_kinds
 from thermostand.stand.commissioning.commissioning import commission
-from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.running.opening.claim import addresses
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
+from thermostand.stand.running.opening.stand_lock import list_addresses
 from thermostand.stand.running.order import Order
-from thermostand.stand.service.hands_on import by_hand, known_devices
+from thermostand.stand.service.bench import list_devices, run_device_verb
 from thermostand.stand.service.run import run_virtual
-from thermostand.stand.simulator import Simulator, laboratory_of, relocated
+from thermostand.stand.simulator import Simulator, describe_laboratory, relocate
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "lamp"
 MODULE = (EXAMPLE / "acme_lamp.py").read_text(encoding="utf-8")
@@ -55,13 +55,15 @@ experiments:
 
 
 def stand_with(**device: object) -> StandConfig:
-    data: dict[str, Any] = yaml.safe_load(packaged("", "simulated").read_text())
+    data: dict[str, Any] = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["devices"] = {"beam": {"kind": "lamp", "address": "tcp:127.0.0.1:15099", **device}}
     return parse_document(yaml.safe_dump(data), StandConfig, "stand.yaml")
 
 
 def test_each_kind_of_device_has_its_fake_and_each_fake_its_kind():
-    settings = {kind.section: kind.fakes if kind.fakes is not None else (kind.section,) for kind in built_in()}
+    settings = {
+        kind.section: kind.fakes if kind.fakes is not None else (kind.section,) for kind in load_built_in_kinds()
+    }
     settings["regulator"] = ("regulator",)  # of the two kinds in that section, one has nothing to be simulated
     fake_of("relays")
     assert sorted(FAKES) == sorted(key for keys in settings.values() for key in keys)
@@ -78,8 +80,8 @@ def laboratory(lamp: None) -> Iterator[StandConfig]:
     """The stand with a lamp, at the addresses of a simulated laboratory that runs in real time."""
     config = stand_with()
     config = config.model_copy(update={"cameras": {}, "axes": {}, "flap": None})
-    started = Simulator(laboratory_of(config, virtual=False, seed=None, is_anywhere=True))
-    yield relocated(config, started.addresses)
+    started = Simulator(describe_laboratory(config, virtual=False, seed=None, is_anywhere=True))
+    yield relocate(config, started.addresses)
     started.stop()
 
 
@@ -104,12 +106,12 @@ def test_a_stand_s_file_names_it_and_its_settings_are_checked():
 def test_it_is_locked_made_polled_shown_and_rehearsed():
     config = stand_with()
     assert ("beam", "tcp 127.0.0.1:15099") in {
-        (each.device, each.place.partition(" in ")[0]) for each in addresses(config)
+        (each.device, each.place.partition(" in ")[0]) for each in list_addresses(config)
     }
     assembly = assemble(config, Hub(), VirtualClock(0))
-    assert "beam" in [poller.sensor.name for poller in assembly.pollers()]
-    assert device_kinds(config)["beam"] == "lamp"
-    (known,) = [each for each in known_devices(config) if each.name == "beam"]
+    assert "beam" in [poller.sensor.name for poller in assembly.make_pollers()]
+    assert list_device_kinds(config)["beam"] == "lamp"
+    (known,) = [each for each in list_devices(config) if each.name == "beam"]
     assert [verb.verb for verb in known.verbs] == ["read", "shine"]
     assert [(each.name, each.unit, each.maximum) for each in known.verbs[1].arguments] == [("percent", "%", 90.0)]
 
@@ -132,7 +134,7 @@ def test_the_check_looks_at_it_and_says_what_to_do(laboratory: StandConfig):
 
 def test_it_obeys_by_hand_and_is_safe_afterwards(laboratory: StandConfig):
     def told(verb: str, **arguments: int) -> float:
-        done = asyncio.run(by_hand(laboratory, "beam", verb, arguments, None, print))
+        done = asyncio.run(run_device_verb(laboratory, "beam", verb, arguments, None, print))
         ((reading,),) = (cast("list[dict[str, float]]", done.data),)
         return reading["value"]
 
@@ -144,7 +146,7 @@ def test_it_obeys_by_hand_and_is_safe_afterwards(laboratory: StandConfig):
 
 @pytest.mark.usefixtures("lamp")
 async def test_a_run_records_what_it_reads(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(RECIPE, devices={"beam": {"kind": "lamp", "address": f"tcp:127.0.0.1:{free_port()}"}})
+    ordered = order(RECIPE, devices={"beam": {"kind": "lamp", "address": f"tcp:127.0.0.1:{find_free_port()}"}})
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, lambda hub: None))
     times_ns, values, *_ = session.readings("beam.current")
     assert len(times_ns) > 10

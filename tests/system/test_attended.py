@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from tests import forked
+from tests import fork_server
 from thermostand.recording.reading.session import Session
 
 PROMPTED = """
@@ -19,7 +19,7 @@ STAND = [sys.executable, "-m", "thermostand.stand.cli"]
 
 def attended(*arguments: object) -> subprocess.Popen[str]:
     command = [*STAND, *map(str, arguments), "--attended"]
-    return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def asked(daemon: subprocess.Popen[str]) -> None:
@@ -44,7 +44,7 @@ def test_an_attended_run_waits_at_its_prompt_also_when_it_is_resumed(tmp_path: P
     with attended("resume", directory) as daemon:
         asked(daemon)
         continued = [*STAND, "continue", str(directory)]
-        while forked.run(continued, capture_output=True, timeout=30).returncode:
+        while fork_server.run(continued, capture_output=True, timeout=30).returncode:
             assert daemon.poll() is None  # its socket comes with its first step
         assert daemon.wait(60) == 0
     session = Session.open(directory)

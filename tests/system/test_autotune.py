@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask, ask_status
-from tests.nightly import by_night
+from tests.daemon_queries import ask, ask_status
+from tests.nightly import mark_nightly
 from tests.system.conftest import SHORT_RECIPE
 from tests.system.test_guard_run import Watcher, check_safe
 from tests.system.test_run import at_step
@@ -29,7 +29,7 @@ async def operated(run: Coroutine[None, None, Path], operate: Coroutine[None, No
     return await running
 
 
-@pytest.mark.parametrize("step", ["soak", by_night("set_temperature")])
+@pytest.mark.parametrize("step", ["soak", mark_nightly("set_temperature")])
 async def test_autotuning_is_held_and_the_run_goes_on_after_clear(
     tmp_path: Path, order: Callable[..., Order], step: str
 ):

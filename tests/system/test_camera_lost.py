@@ -6,22 +6,22 @@ import sys
 
 import pytest
 
-from tests.addresses import usual_camera_address
+from tests.addresses import get_usual_camera_address
 from tests.still_plant import StillPlant
 from tests.system.camera_bench import (
     EXPOSURE_S,
     HEIGHT_px,
     WIDTH_px,
     noise,
-    opened,
+    open_camera,
+    run_virtual_camera,
     settings,
-    virtual,
 )
 from tests.system.conftest import require_aravis
 from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.wires import camera_connection
-from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, WallClock, to_ns
 from thermostand.foundation.errors import Refused, Unreachable
 
 
@@ -32,7 +32,7 @@ def aravis() -> None:
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.05, 1), (0.01, 10)])
 async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: StillPlant, loss: float, burst: int):
-    async with virtual(plant) as (clock, fake), opened(clock, packet_size=1500) as camera:
+    async with run_virtual_camera(plant) as (clock, fake), open_camera(clock, packet_size=1500) as camera:
         fake.faults.loss, fake.faults.burst = loss, burst
         for _ in range(3):
             frame = await camera.grab()
@@ -44,9 +44,9 @@ async def test_lost_packets_are_asked_for_again_and_no_bit_differs(plant: StillP
 async def test_without_resend_a_frame_with_holes_is_never_used(plant: StillPlant, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 4.0)  # what each of three frames is waited for
     monkeypatch.setattr(camera_connection, "FRAME_RETENTION_PERIODS", 0.4)  # a busy machine hears of it in time
-    async with virtual(plant) as (clock, fake):
+    async with run_virtual_camera(plant) as (clock, fake):
         fake.faults.no_resend = True
-        async with opened(clock, packet_size=1500) as camera:
+        async with open_camera(clock, packet_size=1500) as camera:
             fake.faults.loss = 0.05
             with pytest.raises(Unreachable, match="3 software triggers"):
                 await camera.grab()
@@ -59,7 +59,10 @@ async def test_without_resend_a_frame_with_holes_is_never_used(plant: StillPlant
 
 async def test_three_missing_frames_of_a_free_run_are_a_lost_camera(plant: StillPlant, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 0.5)  # what each of three frames is waited for
-    async with virtual(plant) as (clock, fake), opened(clock, trigger="free_run", frame_rate_hz=2) as camera:
+    async with (
+        run_virtual_camera(plant) as (clock, fake),
+        open_camera(clock, trigger="free_run", frame_rate_hz=2) as camera,
+    ):
         await camera.grab()
         fake.faults.silent_gvsp = True
         with pytest.raises(Unreachable, match="3 frame periods"):
@@ -73,7 +76,7 @@ async def test_three_missing_frames_of_a_free_run_are_a_lost_camera(plant: Still
 
 
 async def test_a_lost_frame_is_counted_and_the_next_trigger_brings_the_frame(fake: FakeCamera):
-    async with opened() as camera:
+    async with open_camera() as camera:
         await camera.grab()
         fake.faults.silent_gvsp = True
         grabbing = asyncio.create_task(camera.grab())
@@ -87,11 +90,11 @@ async def test_a_lost_frame_is_counted_and_the_next_trigger_brings_the_frame(fak
 async def test_a_trigger_executed_twice_does_not_leave_an_old_frame_behind(fake: FakeCamera):
     clock = WallClock()
     fake.faults.trigger_twice = True
-    async with opened(clock) as camera:
+    async with open_camera(clock) as camera:
         for _ in range(3):
             before_ns = clock.now_ns()
             frame = await camera.grab()
-            begin_ns = frame.time_ns - seconds_ns(frame.exposure_s / 2)
+            begin_ns = frame.time_ns - to_ns(frame.exposure_s / 2)
             assert before_ns <= begin_ns < before_ns + NS_PER_S // 2
         assert camera.counters()["stale"] >= 1
 
@@ -134,7 +137,7 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_unreachable_unt
     fake.faults.no_stream_channel = True
     fake.restart()
     clock = WallClock()
-    await clock.sleep_until(clock.now_ns() + seconds_ns(0.3))  # it boots
+    await clock.sleep_until(clock.now_ns() + to_ns(0.3))  # it boots
     await camera.open()
     with pytest.raises(Unreachable, match="stream channel"):
         await camera.grab()
@@ -154,16 +157,16 @@ async def why_unreachable(camera: AravisCamera) -> str:
 
 async def test_a_camera_that_froze_past_its_heartbeat_is_lost_and_comes_back(fake: FakeCamera):
     clock = WallClock()
-    async with opened(clock) as camera:
+    async with open_camera(clock) as camera:
         await camera.grab()
         fake.faults.silent_gvcp = True
-        await clock.sleep_until(clock.now_ns() + seconds_ns(2.0))
+        await clock.sleep_until(clock.now_ns() + to_ns(2.0))
         fake.faults.silent_gvcp = False
-        deadline_ns = clock.now_ns() + seconds_ns(8.0)
+        deadline_ns = clock.now_ns() + to_ns(8.0)
         reason = ""
         while not reason and clock.now_ns() < deadline_ns:
             reason = await why_unreachable(camera)
-            await clock.sleep_until(clock.now_ns() + seconds_ns(0.05))
+            await clock.sleep_until(clock.now_ns() + to_ns(0.05))
         assert "control lost" in reason
         assert camera.counters()["lost"] == 1
         await camera.open()
@@ -172,7 +175,7 @@ async def test_a_camera_that_froze_past_its_heartbeat_is_lost_and_comes_back(fak
 
 @pytest.mark.usefixtures("fake")
 async def test_while_another_client_controls_the_camera_open_is_refused():
-    async with opened():
+    async with open_camera():
         other = AravisCamera("other", settings(), WallClock())
         with pytest.raises(Refused, match="another client controls"):
             await other.open()
@@ -191,7 +194,9 @@ os._exit(0)
 
 @pytest.mark.usefixtures("fake")
 async def test_after_a_crash_of_our_own_open_waits_for_the_heartbeat():
-    process = await asyncio.to_thread(subprocess.run, [sys.executable, "-c", CRASH, usual_camera_address()], check=True)
+    process = await asyncio.to_thread(
+        subprocess.run, [sys.executable, "-c", CRASH, get_usual_camera_address()], check=True
+    )
     assert process.returncode == 0
-    async with opened() as camera:
+    async with open_camera() as camera:
         await camera.grab()

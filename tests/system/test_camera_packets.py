@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator
 import pytest
 
 from tests.still_plant import StillPlant
-from tests.system.camera_bench import noise, opened, simulated, virtual
+from tests.system.camera_bench import noise, open_camera, run_simulated_camera, run_virtual_camera
 from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.gvsp_sender import StreamSender
@@ -21,7 +21,7 @@ FRAMES = 5
 
 @pytest.fixture
 async def wired(plant: StillPlant) -> AsyncGenerator[tuple[VirtualClock, FakeCamera]]:
-    async with virtual(plant) as both:
+    async with run_virtual_camera(plant) as both:
         yield both
 
 
@@ -49,7 +49,7 @@ async def test_a_frame_that_a_busy_machine_holds_up_half_way_is_waited_for_in_vi
         if holds_s:
             threading.Event().wait(holds_s.pop())
 
-    async with opened(clock, packet_size=1500) as camera:
+    async with open_camera(clock, packet_size=1500) as camera:
         monkeypatch.setattr(StreamSender, "_pace", pace_and_hold)
         frames = await grabbed(camera, clock, 2)
     assert holds_s == []
@@ -60,7 +60,7 @@ async def test_a_frame_that_a_busy_machine_holds_up_half_way_is_waited_for_in_vi
 @pytest.mark.parametrize("fault", ["doubled", "reordered"])
 async def test_packets_that_come_twice_or_late_make_the_same_frame(wired: tuple[VirtualClock, FakeCamera], fault: str):
     clock, fake = wired
-    async with opened(clock, packet_size=1500) as camera:
+    async with open_camera(clock, packet_size=1500) as camera:
         setattr(fake.faults, fault, 0.2)
         assert all(map(is_right, await grabbed(camera, clock)))
         assert camera.counters().get("lost", 0) == 0
@@ -70,8 +70,8 @@ async def test_packets_that_come_twice_or_late_make_the_same_frame(wired: tuple[
 async def test_a_frame_is_waited_for_until_the_next_one_is_due(plant: StillPlant, fault: str):
     """In real time: Aravis' own patience, 0.1 s behind the last packet, would give up a camera that sends its leader
     with the begin of the exposure."""
-    with simulated(WallClock(), plant) as fake:
-        async with opened(packet_size=1500, frame_rate_hz=0.5) as camera:
+    with run_simulated_camera(WallClock(), plant) as fake:
+        async with open_camera(packet_size=1500, frame_rate_hz=0.5) as camera:
             setattr(fake.faults, fault, 0.4)
             assert (await camera.grab()).dropped == 0
             counters = camera.counters()
@@ -80,7 +80,7 @@ async def test_a_frame_is_waited_for_until_the_next_one_is_due(plant: StillPlant
 
 async def test_a_frame_with_a_packet_cut_short_is_never_used(wired: tuple[VirtualClock, FakeCamera]):
     clock, fake = wired
-    async with opened(clock, packet_size=1500) as camera:
+    async with open_camera(clock, packet_size=1500) as camera:
         await grabbed(camera, clock, 1)
         fake.faults.truncated = 0.01  # one or two of a frame's 220 packets
         frames = list[Frame]()
@@ -101,14 +101,14 @@ async def test_frames_larger_than_the_camera_has_said_are_counted_and_never_used
 ):
     clock, fake = wired
     fake.faults.payload_short_bytes = 5000
-    async with opened(clock, packet_size=1500, height_px=64) as camera:
+    async with open_camera(clock, packet_size=1500, height_px=64) as camera:
         with pytest.raises(Unreachable):
             await camera.grab()
         counted = camera.counters()
         assert counted.get("incomplete_size_mismatch", 0) + counted.get("wrong_size", 0) > 0, counted
         fake.faults.payload_short_bytes = 0
         await camera.close()
-    async with opened(clock, packet_size=1500, height_px=32) as camera:
+    async with open_camera(clock, packet_size=1500, height_px=32) as camera:
         frame = await camera.grab()
         assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)[:32]).all()
 
@@ -118,7 +118,7 @@ async def test_answers_that_come_twice_or_are_announced_as_late_are_taken_once(
     wired: tuple[VirtualClock, FakeCamera], fault: str, value: int
 ):
     clock, fake = wired
-    async with opened(clock, heartbeat_s=3.0) as camera:
+    async with open_camera(clock, heartbeat_s=3.0) as camera:
         await grabbed(camera, clock, 1)
         setattr(fake.faults, fault, value)
         (frame,) = await grabbed(camera, clock, 1)
@@ -136,7 +136,7 @@ async def test_a_time_stamp_that_cannot_be_is_counted_and_the_frame_has_the_trig
 ):
     monkeypatch.setattr(camera_connection, "VIRTUAL_TIMEOUT_S", 1.0)  # after a jump back one frame seems stale
     clock, fake = wired
-    async with opened(clock) as camera:
+    async with open_camera(clock) as camera:
         await grabbed(camera, clock, 2)
         await clock.sleep_until(clock.now_ns() + 60 * NS_PER_S)
         fake.faults.stamp = stamp  # pyright: ignore[reportAttributeAccessIssue] - one of the two
@@ -153,7 +153,7 @@ async def test_a_camera_whose_clock_does_not_tick_is_used_by_the_stands_clock(
 ):
     clock, fake = wired
     fake.faults.no_ticks = True
-    async with opened(clock) as camera:
+    async with open_camera(clock) as camera:
         assert all(map(is_right, await grabbed(camera, clock, 2)))
         assert camera.restarted == ""
 
@@ -161,6 +161,6 @@ async def test_a_camera_whose_clock_does_not_tick_is_used_by_the_stands_clock(
 async def test_an_unpaced_burst_at_the_kernels_usual_buffer_comes_whole(wired: tuple[VirtualClock, FakeCamera]):
     clock, fake = wired
     fake.faults.unpaced = True
-    async with opened(clock, packet_size=1500) as camera:
+    async with open_camera(clock, packet_size=1500) as camera:
         assert all(map(is_right, await grabbed(camera, clock)))
         assert camera.effective.receive_buffer_bytes > 0

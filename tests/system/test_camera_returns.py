@@ -7,7 +7,7 @@ from tests.system.test_run_ends import SHORTER, break_now
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
@@ -34,7 +34,7 @@ async def test_a_camera_that_returns_without_a_stream_channel_is_tried_until_it_
 
     session = Session.open(await run_virtual(ordered, tmp_path / "out", None, watch))
     assert session.events()[-1].text == "complete"
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     assert (
         len([meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]) == 3
     )

@@ -17,10 +17,10 @@ from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.guarding.rules import camera_measured
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.guarding.rules import watch_camera_temperature
 from thermostand.stand.running.memory.entries import Again, StepChanged
-from thermostand.stand.running.memory.fold import after, fold
+from thermostand.stand.running.memory.fold import apply_entry, fold
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
@@ -117,8 +117,8 @@ async def test_a_camera_that_is_configured_to_have_no_temperature_is_not_asked_f
 
 
 def test_no_temperature_is_asked_of_a_camera_that_is_off_lost_or_has_taken_its_last_frame():
-    config, hub = load_config(packaged("", "simulated")), Hub()
-    (watch,) = camera_measured(config, lambda: is_due)
+    config, hub = load_config(find_packaged("", "simulated")), Hub()
+    (watch,) = watch_camera_temperature(config, lambda: is_due)
     now_ns, is_due = 0, True
 
     def held(reading: Reading) -> bool:
@@ -144,17 +144,17 @@ def test_frames_are_to_come_until_the_last_capture_of_the_plan_is_done():
     plan = [PlannedStep(0, "a", Soak(1.0)), PlannedStep(1, "b", capture), PlannedStep(2, "c", capture)]
     state = fold(plan, [StepChanged(0, "a", "done"), StepChanged(0, "b", "done")])
     assert state.frames_to_come
-    state = after(state, StepChanged(0, "c", "started"))
+    state = apply_entry(state, StepChanged(0, "c", "started"))
     assert state.frames_to_come
-    state = after(state, StepChanged(0, "c", "done"))
+    state = apply_entry(state, StepChanged(0, "c", "done"))
     assert not state.frames_to_come
-    assert after(state, Again(0, ["c"])).frames_to_come
-    assert not after(state, Again(0, ["a"])).frames_to_come
+    assert apply_entry(state, Again(0, ["c"])).frames_to_come
+    assert not apply_entry(state, Again(0, ["a"])).frames_to_come
     assert not fold(plan[:1], []).frames_to_come
 
 
 def test_a_camera_without_a_temperature_must_not_say_where_it_is(tmp_path: Path):
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["cameras"]["camera"] |= {"has_temperature": False, "temperature": {"entry": "Sensor"}}
     config = tmp_path / "stand.yaml"
     config.write_text(yaml.safe_dump(data))

@@ -13,16 +13,16 @@ from tests.system.camera_bench import (
     SERIAL,
     START_NS,
     noise,
-    opened,
+    open_camera,
+    run_simulated_camera,
+    run_virtual_camera,
     settings,
-    simulated,
-    virtual,
 )
 from tests.system.conftest import require_aravis
 from thermostand.drivers.devices.cameras.camera_gige import AravisCamera
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.wires.camera_settings import TemperatureFeature
-from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, WallClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Refused
 from thermostand.foundation.readings import Quality
 
@@ -35,10 +35,10 @@ def aravis() -> None:
 @pytest.mark.parametrize("wanted", [SERIAL, None], ids=["of a configured number", "of any number"])
 async def test_another_camera_at_the_address_of_the_first_gets_no_setting(plant: StillPlant, wanted: str | None):
     """Control is taken, which Aravis does when it opens one; nothing else is written."""
-    with simulated(WallClock(), plant):
+    with run_simulated_camera(WallClock(), plant):
         camera = AravisCamera("camera", settings(serial_number=wanted), WallClock())
         await camera.open()
-    with simulated(WallClock(), plant, "C9999") as stranger:
+    with run_simulated_camera(WallClock(), plant, "C9999") as stranger:
         before = {name: stranger._registers.integer(name) for name in ("GevSCPSPacketSize", "GevSCPD", "PixelFormat")}
         for _ in range(2):
             with pytest.raises((DeviceFault, Refused), match=f"C9999 answers|C9999, version .* where .* {SERIAL}"):
@@ -51,7 +51,7 @@ async def test_another_camera_at_the_address_of_the_first_gets_no_setting(plant:
 
 @pytest.mark.usefixtures("fake")
 async def test_all_settings_are_taken_and_read_back():
-    async with opened(gain_dB=6.0, packet_size=8000, packet_delay_ns=1000) as camera:
+    async with open_camera(gain_dB=6.0, packet_size=8000, packet_delay_ns=1000) as camera:
         assert camera.identity.serial_number == SERIAL
         effective = camera.effective
     assert (effective.width_px, effective.height_px, effective.payload_bytes) == (640, 480, 640 * 480)
@@ -62,32 +62,32 @@ async def test_all_settings_are_taken_and_read_back():
 
 @pytest.mark.usefixtures("fake")
 async def test_aravis_finds_a_packet_size_larger_than_an_ethernet_frame_on_loopback():
-    async with opened() as camera:
+    async with open_camera() as camera:
         assert camera.effective.packet_size > 8000
 
 
 async def test_under_virtual_time_a_trigger_stamps_the_middle_of_the_exposure_to_the_nanosecond(plant: StillPlant):
-    async with virtual(plant) as (clock, _), opened(clock) as camera:
+    async with run_virtual_camera(plant) as (clock, _), open_camera(clock) as camera:
         for number in range(3):
             await clock.sleep_until(START_NS + number * 600 * NS_PER_S)
             frame = await camera.grab()
             assert clock.now_ns() == START_NS + number * 600 * NS_PER_S
-            assert frame.time_ns == clock.now_ns() + seconds_ns(frame.exposure_s / 2)
+            assert frame.time_ns == clock.now_ns() + to_ns(frame.exposure_s / 2)
             assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all()
             assert (frame.block_id, frame.dropped, frame.camera_degC) == (number + 1, 0, 41.5)
 
 
 async def test_under_virtual_time_a_free_run_gives_the_next_frame_and_never_an_old_one(plant: StillPlant):
-    async with virtual(plant) as (clock, _):
+    async with run_virtual_camera(plant) as (clock, _):
         started_ns = START_NS + 5 * NS_PER_S
         await clock.sleep_until(started_ns)  # or the camera's clock would still show 0: no time stamps
-        async with opened(clock, trigger="free_run", frame_rate_hz=2.0) as camera:
+        async with open_camera(clock, trigger="free_run", frame_rate_hz=2.0) as camera:
             await camera.start()
             for after_s in (0.0, 0.4, 3.3, 2700.1, 2700.9):
-                await clock.sleep_until(started_ns + seconds_ns(after_s))
+                await clock.sleep_until(started_ns + to_ns(after_s))
                 frame = await camera.grab()
                 number = math.ceil(2 * after_s)
-                assert frame.time_ns == started_ns + number * NS_PER_S // 2 + seconds_ns(frame.exposure_s / 2)
+                assert frame.time_ns == started_ns + number * NS_PER_S // 2 + to_ns(frame.exposure_s / 2)
                 assert (frame.block_id, frame.dropped) == (number + 1, 0)
                 assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all()
             assert camera.counters().get("missed", 0) == 0
@@ -96,7 +96,7 @@ async def test_under_virtual_time_a_free_run_gives_the_next_frame_and_never_an_o
 @pytest.mark.usefixtures("fake")
 async def test_in_real_time_a_free_run_is_stamped_by_the_cameras_clock():
     clock = WallClock()
-    async with opened(clock, trigger="free_run", frame_rate_hz=10.0) as camera:
+    async with open_camera(clock, trigger="free_run", frame_rate_hz=10.0) as camera:
         await camera.start()
         await clock.sleep_until(clock.now_ns() + NS_PER_S)
         before_ns = clock.now_ns()
@@ -109,11 +109,11 @@ async def test_in_real_time_a_free_run_is_stamped_by_the_cameras_clock():
 
 async def test_in_a_free_run_the_periods_without_a_frame_are_counted(fake: FakeCamera):
     clock = WallClock()
-    async with opened(clock, trigger="free_run", frame_rate_hz=10.0) as camera:
+    async with open_camera(clock, trigger="free_run", frame_rate_hz=10.0) as camera:
         await camera.grab()
         fake.faults.silent_gvsp = True
         grabbing = asyncio.create_task(camera.grab())
-        await clock.sleep_until(clock.now_ns() + seconds_ns(0.4))
+        await clock.sleep_until(clock.now_ns() + to_ns(0.4))
         fake.faults.silent_gvsp = False
         frame = await grabbing
         assert frame.dropped >= 2
@@ -121,14 +121,14 @@ async def test_in_a_free_run_the_periods_without_a_frame_are_counted(fake: FakeC
 
 
 async def test_an_exposure_may_change_from_frame_to_frame_of_a_free_run(plant: StillPlant):
-    async with virtual(plant) as (clock, _):
+    async with run_virtual_camera(plant) as (clock, _):
         await clock.sleep_until(START_NS + 5 * NS_PER_S)
-        async with opened(clock, trigger="free_run") as camera:
+        async with open_camera(clock, trigger="free_run") as camera:
             for exposure_s in (0.05, 0.2, 0.02):
-                await clock.sleep_until(clock.now_ns() + seconds_ns(7.3))
+                await clock.sleep_until(clock.now_ns() + to_ns(7.3))
                 called_ns = clock.now_ns()
                 frame = await camera.grab(exposure_s)
-                begin_ns = frame.time_ns - seconds_ns(frame.exposure_s / 2)
+                begin_ns = frame.time_ns - to_ns(frame.exposure_s / 2)
                 assert frame.exposure_s == pytest.approx(exposure_s, abs=50e-6)
                 assert 0 <= begin_ns - called_ns < NS_PER_S
                 assert (frame.image == noise(frame.time_ns, frame.exposure_s, 0.0)).all()
@@ -137,7 +137,7 @@ async def test_an_exposure_may_change_from_frame_to_frame_of_a_free_run(plant: S
 
 @pytest.mark.usefixtures("fake")
 async def test_an_exposure_is_set_for_one_frame():
-    async with opened() as camera:
+    async with open_camera() as camera:
         long = await camera.grab(2 * EXPOSURE_S)
         usual = await camera.grab()
     assert long.exposure_s == pytest.approx(2 * EXPOSURE_S, abs=50e-6)
@@ -146,7 +146,7 @@ async def test_an_exposure_is_set_for_one_frame():
 
 @pytest.mark.usefixtures("fake")
 async def test_a_clamped_exposure_is_refused_and_does_not_stay():
-    async with opened() as camera:
+    async with open_camera() as camera:
         with pytest.raises(Refused, match="ExposureTime"):
             await camera.grab(10_000.0)
         frame = await camera.grab()
@@ -164,7 +164,7 @@ async def test_a_clamped_exposure_is_refused_and_does_not_stay():
 async def test_the_temperature_is_a_reading_and_belongs_to_each_frame(
     temperature: TemperatureFeature | None, value_degC: float
 ):
-    async with opened(temperature=temperature) as camera:
+    async with open_camera(temperature=temperature) as camera:
         (reading,) = await camera.read()
         frame = await camera.grab()
     assert (reading.channel, reading.value, reading.quality) == ("camera.temperature", value_degC, Quality.GOOD)
@@ -172,7 +172,7 @@ async def test_the_temperature_is_a_reading_and_belongs_to_each_frame(
 
 
 async def test_a_broken_temperature_is_bad_and_the_frames_go_on(fake: FakeCamera):
-    async with opened() as camera:
+    async with open_camera() as camera:
         faults: dict[Literal["zero", "access", "nan"], str] = {
             "zero": "exactly 0 degC",
             "access": "DeviceTemperature",
@@ -191,17 +191,17 @@ async def test_a_broken_temperature_is_bad_and_the_frames_go_on(fake: FakeCamera
 async def test_a_camera_that_would_free_itself_between_two_requests_is_refused(fake: FakeCamera):
     fake.faults.heartbeat_most_ms = 600
     with pytest.raises(Refused, match=r"1\.5 s was asked .* 0\.6 s"):
-        async with opened():
+        async with open_camera():
             pass
     fake.faults.heartbeat_most_ms = 1300
-    async with opened() as camera:
+    async with open_camera() as camera:
         assert camera.effective.heartbeat_s == 1.3
 
 
 @pytest.mark.usefixtures("fake")
 async def test_an_unknown_selector_entry_is_a_bad_reading():
     place = TemperatureFeature(entry="Lens")
-    async with opened(temperature=place) as camera:
+    async with open_camera(temperature=place) as camera:
         (reading,) = await camera.read()
         await camera.grab()
     assert reading.quality is Quality.BAD

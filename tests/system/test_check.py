@@ -12,8 +12,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from tests.addresses import free_port
-from thermostand.drivers.devices.checking import Finding
+from tests.addresses import find_free_port
+from thermostand.drivers.devices.device_check import Finding
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import read_document
 from thermostand.foundation.errors import DeviceFault, InUse
@@ -21,12 +21,12 @@ from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import assemble
 from thermostand.stand.commands.check_cli import app
 from thermostand.stand.commissioning.commissioning import commission
-from thermostand.stand.config.checked import doubt, load_checked
+from thermostand.stand.config.check_record import explain_unchecked, load_check_record
 from thermostand.stand.config.stand_config import load_config
-from thermostand.stand.running.opening.claim import claimed
-from thermostand.stand.running.opening.open_stand import opened
+from thermostand.stand.running.opening.open_stand import open_assembly
+from thermostand.stand.running.opening.stand_lock import lock_stand
 from thermostand.stand.running.opening.stop import Interrupted, Stop
-from thermostand.stand.running.order import Order, load_order, register_texts
+from thermostand.stand.running.order import Order, load_order, read_register_texts
 from thermostand.stand.simulator import ControlSocket, Simulator
 
 
@@ -82,20 +82,20 @@ def test_without_moves_each_device_tells_what_it_is_and_the_record_goes_with_ses
     assert still
     assert {name: after[name] for name in still} == {name: before[name] for name in still}
 
-    record = load_checked(config)
+    record = load_check_record(config)
     assert record is not None
     assert not record.moved
     assert config.with_name("config.check.html").read_text().count("<tr>") > len(findings)
     assert load_order("demo", str(config)).attachments()["commissioning.json"] == record.text
-    texts = {"config.yaml": read_document(config), **register_texts(load_config(config))}
-    assert doubt(config, record, texts, is_simulated=False) == ""
-    changed = doubt(config, record, {**texts, "config.yaml": "another"}, is_simulated=True)
+    texts = {"config.yaml": read_document(config), **read_register_texts(load_config(config))}
+    assert explain_unchecked(config, record, texts, is_simulated=False) == ""
+    changed = explain_unchecked(config, record, {**texts, "config.yaml": "another"}, is_simulated=True)
     assert changed.startswith(f"{config} has changed since ")
-    assert "registers-relays.yaml has changed" in doubt(
+    assert "registers-relays.yaml has changed" in explain_unchecked(
         config, record, {**texts, "registers-relays.yaml": ""}, is_simulated=True
     )
-    assert "was never checked" in doubt(config, None, texts, is_simulated=False)
-    assert doubt(config, None, texts, is_simulated=True) == ""
+    assert "was never checked" in explain_unchecked(config, None, texts, is_simulated=False)
+    assert explain_unchecked(config, None, texts, is_simulated=True) == ""
 
 
 def test_what_is_wrong_is_said_of_its_device_and_keeps_none_of_the_others(config: Path) -> None:
@@ -115,7 +115,7 @@ def test_what_is_wrong_is_said_of_its_device_and_keeps_none_of_the_others(config
     assert "axes.linear.address and serial_number" in advice["linear"]
     assert "mend the relays first" in advice["camera"]
     assert ("thermometers", "each other") in verdicts(findings, "ok")
-    record = load_checked(config)
+    record = load_check_record(config)
     assert record is not None
     assert record.failed == 4
 
@@ -125,7 +125,7 @@ def test_a_set_point_that_would_not_be_in_force_is_found_and_no_run_begins_with_
 ) -> None:
     data = yaml.safe_load(config_text(axes={}))
     del data["regulator"], data["relays"], data["axes"]["linear"], data["axes"]["rotary"]
-    address = f"tcp:127.0.0.1:{free_port()}"
+    address = f"tcp:127.0.0.1:{find_free_port()}"
     limits: dict[str, object] = {"limits_at_panel_degC": [-10, 60], "gap_s": 0.0, "poll_s": 0.5}
     data["climate_chamber"] = {"protocol": "julabo", "address": address, **limits}
     config = tmp_path / "config.yaml"
@@ -139,7 +139,7 @@ def test_a_set_point_that_would_not_be_in_force_is_found_and_no_run_begins_with_
 
     async def run() -> None:
         assembly = assemble(load_config(config), Hub(), WallClock())
-        async with Stop() as stop, opened(assembly, None, stop, is_for_one=True):
+        async with Stop() as stop, open_assembly(assembly, None, stop, is_for_one=True):
             pytest.fail("it is open")
 
     with pytest.raises(DeviceFault, match="working temperature T2 acts"):
@@ -182,7 +182,7 @@ async def test_one_that_is_broken_off_switches_the_cameras_off_again_that_it_has
 
 async def test_a_stand_that_another_program_has_is_not_touched(config: Path, tmp_path: Path) -> None:
     reported: list[tuple[Finding, ...]] = []
-    async with claimed(load_config(config), tmp_path / "session"):
+    async with lock_stand(load_config(config), tmp_path / "session"):
         with pytest.raises(InUse, match="in use by session "):
             await commission(load_config(config), reported.append, has_moves=False)
     assert reported == []

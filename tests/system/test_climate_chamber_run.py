@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.addresses import free_port
-from tests.asking import ask
+from tests.addresses import find_free_port
+from tests.daemon_queries import ask
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated, trips_of
 from tests.system.test_run import fault, ignore
 from tests.system.test_run_ends import SHORTER
@@ -16,7 +16,7 @@ from thermostand.foundation.documents import load_document, parse_document
 from thermostand.foundation.errors import ConfigError, DeviceFault
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
@@ -27,7 +27,7 @@ NIGHTLY = [pytest.param(make, marks=pytest.mark.nightly) for make in ("simserv",
 def settings_of(make: str, **changes: object) -> dict[str, object]:
     settings: dict[str, object] = {
         "protocol": make,
-        "address": f"tcp:127.0.0.1:{free_port()}",
+        "address": f"tcp:127.0.0.1:{find_free_port()}",
         "gap_s": 0.0,
         "poll_s": 5.0,
     }
@@ -49,7 +49,7 @@ def chamber_order(tmp_path: Path, config_text: Callable[..., str]) -> Callable[.
         config_file, recipe_file = tmp_path / "config.yaml", tmp_path / "recipe.yaml"
         config_file.write_text(text)
         recipe_file.write_text(recipe)
-        target = packaged("targets", "paper-9x6").read_text()
+        target = find_packaged("targets", "paper-9x6").read_text()
         loaded = load_document(recipe_file, Recipe)
         return Order(load_config(config_file), loaded, text, recipe, target, at_configured_addresses=True)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask
+from tests.daemon_queries import ask
 from tests.system.conftest import AS_INSTALLED
 from tests.system.resume_process import Daemon
 from tests.system.test_guard_run import Watcher
@@ -20,13 +20,13 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.reading.session import Session
-from thermostand.stand.running.executing.actions import cold_start
+from thermostand.stand.running.executing.actions import find_cold_start_steps
 from thermostand.stand.running.memory.entries import StepChanged
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import run_virtual
 
 WARM_UP = """
@@ -51,7 +51,7 @@ def test_a_warm_up_that_was_killed_begins_again_from_a_cold_camera(tmp_path: Pat
     (capture,) = (planned for planned in ordered.recipe.plan() if isinstance(planned.step, Capture))
     restarts = [event for event in session.events() if event.kind == "capture_restarted"]
     assert len(restarts) == 2
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     assert begins_ns == {capture.step_id: restarts[-1].time_ns}
     frames = [
         frame
@@ -72,7 +72,7 @@ def again(plan, done, begun):
     entries = [StepChanged(0, step_id, "started") for step_id in begun] + [
         StepChanged(0, step_id, "done") for step_id in done
     ]
-    return cold_start(fold(plan, entries))
+    return find_cold_start_steps(fold(plan, entries))
 
 
 def test_only_what_follows_from_a_warm_camera_is_done_again(order: Callable[..., Order]):
@@ -136,10 +136,10 @@ def test_nothing_is_superseded_in_a_run_that_was_not_interrupted(tmp_path: Path,
     assert daemon.lives_for(1, "StepMark")
     daemon.kill()
     (directory,) = (tmp_path / "out").iterdir()
-    before = interruption(directory)
-    assert cold_start(before.state) == ()
+    before = load_interruption(directory)
+    assert find_cold_start_steps(before.state) == ()
     before.release()
-    assert begins_of(Session.open(directory).events()) == {}
+    assert find_restart_times(Session.open(directory).events()) == {}
     asyncio.run(end_laboratory(ordered))
 
 
@@ -177,7 +177,7 @@ async def test_a_warm_up_that_an_interlock_has_held_begins_again_from_a_cold_cam
     await asyncio.gather(*tasks)
     session = Session.open(directory)
     (capture,) = (planned for planned in ordered.recipe.plan() if isinstance(planned.step, Capture))
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     (restart,) = [event for event in session.events() if event.kind == "capture_restarted"]
     assert begins_ns == {capture.step_id: restart.time_ns}
     counted = [meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]
@@ -236,7 +236,7 @@ async def test_a_warm_up_that_is_paused_for_long_begins_again_from_its_cool_down
 ):
     ordered = order(WARM_UP, **AS_INSTALLED)
     session = await paused(ordered, tmp_path / "out", 100.0)
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     counted = [meta for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)]
     assert len(counted) == 8
     held_ns = next(event.time_ns for event in session.events() if event.kind == "held")

@@ -9,8 +9,8 @@ from tests.system.conftest import AS_INSTALLED
 from tests.system.gateway import gateway
 from tests.system.test_guard_wire import Start, bench_from
 from tests.system.test_relay_keeper import COMPRESSOR, ON, RELAYS, another_master, seconds_until
-from thermostand.foundation.clock import seconds_ns
-from thermostand.stand.chamber.compressor import restored
+from thermostand.foundation.clock import to_ns
+from thermostand.stand.chamber.compressor import load_state
 from thermostand.stand.config.stand_config import CompressorConfig
 from thermostand.stand.running.order import Order
 
@@ -26,7 +26,7 @@ def keeping(order: Order, path: Path) -> Order:
 
 def start_ns(order: Order) -> int:
     assert order.config.simulation is not None
-    return seconds_ns(order.config.simulation.start.timestamp())
+    return to_ns(order.config.simulation.start.timestamp())
 
 
 async def test_a_compressor_whose_start_nobody_saw_confirmed_and_that_dropped_rests(
@@ -70,9 +70,9 @@ async def test_a_compressor_that_somebody_else_switched_on_is_kept_as_started_an
             switched_ns = bench.clock.now_ns()
             assert await seconds_until(bench, "compressor_on", 0, 20) <= 10
             await bench.wait(1)
-            kept = restored(path, bench.clock.now_ns(), None)
+            kept = load_state(path, bench.clock.now_ns(), None)
             assert not kept.running
-            assert 0 <= kept.since_ns - switched_ns <= seconds_ns(10)
+            assert 0 <= kept.since_ns - switched_ns <= to_ns(10)
             assert len(kept.starts_ns) == number
             await bench.assembly.stand.chamber.stop()
             await bench.wait(5)

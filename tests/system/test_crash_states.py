@@ -27,7 +27,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_unfinished
-from thermostand.stand.chamber.compressor import restored
+from thermostand.stand.chamber.compressor import load_state
 from thermostand.stand.running.memory.journal import Journal
 from thermostand.stand.service.queue_file import read_queue
 
@@ -138,7 +138,7 @@ def journal_of(session):
 
 def compressor_of(path):
     """How often its state had been kept; 0 when nothing can be read."""
-    starts_ns = restored(path, 1_000_000 * NS_PER_S, None).starts_ns
+    starts_ns = load_state(path, 1_000_000 * NS_PER_S, None).starts_ns
     return starts_ns[0] if starts_ns else 0
 
 

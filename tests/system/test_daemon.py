@@ -16,8 +16,8 @@ from typing import cast
 
 import pytest
 
-from tests import forked
-from tests.nightly import by_night
+from tests import fork_server
+from tests.nightly import mark_nightly
 from tests.system.test_real_time import BRIEF as CYCLE
 from tests.system.test_two_runs import Laboratory
 from thermostand.foundation.clock import WallClock
@@ -27,13 +27,13 @@ from thermostand.foundation.items import Event
 from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.running.guest import Guest
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.running.run import Run
 from thermostand.stand.service.daemon import Daemon
 from thermostand.stand.service.serve import serve as serve_stand
 from thermostand.stand.service.stand_service import DeviceRequest, StandService, SubmitRequest
-from thermostand.stand.serving.client import Server, server_of
-from thermostand.stand.serving.desk import Conflict, StandState, Who
+from thermostand.stand.serving.api_models import Conflict, StandState, Who
+from thermostand.stand.serving.client import Server, find_session_server
 
 LIMIT_S = 120.0  # for a busy machine
 BRIEF = """
@@ -50,11 +50,11 @@ class Served:
         self.out = out
         arguments = ["--config", str(config_file), "--out", str(out), "--no-reports"]
         command = [sys.executable, "-m", "thermostand.stand.cli", "serve", *arguments]
-        self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.process = fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     @property
     def server(self) -> Server:
-        return server_of(self.out)
+        return find_session_server(self.out)
 
     def state(self) -> StandState:
         return self.server.state(20.0)
@@ -283,7 +283,7 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(
         "--out",
         str(tmp_path),
     ]
-    refused = forked.popen(run, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    refused = fork_server.popen(run, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert "the stand has tripped" in refused.communicate()[0]
     assert refused.returncode == 1
     again = serve()
@@ -295,7 +295,7 @@ def test_a_trip_between_runs_is_latched_over_a_restart_until_it_is_cleared(
     again.until(lambda state: state.fault is None and states_of(state) == ["done"])
 
 
-@pytest.mark.parametrize("kills", [2, by_night(20)])
+@pytest.mark.parametrize("kills", [2, mark_nightly(20)])
 def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, tmp_path: Path, kills: int):
     """Killed as soon as the stand's state says it; what is left is reset without a daemon."""
     for kill in range(kills):
@@ -309,7 +309,7 @@ def test_a_trip_that_somebody_has_heard_of_is_never_forgotten(laboratory: Path, 
             served.process.send_signal(signal.SIGKILL)
             served.process.communicate()
         command = [sys.executable, "-m", "thermostand.stand.cli", "reset", "--config", str(laboratory)]
-        process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        process = fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         assert "reset: the folder" in process.communicate()[0]
         assert process.returncode == 0
 
@@ -350,7 +350,7 @@ def run_command(config_file: Path, recipe: str, *options: str) -> "subprocess.Po
         str(config_file),
         *options,
     ]
-    return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_stand_run_goes_through_the_daemon_that_has_the_stand(serve: Callable[[], Served], laboratory: Path):
@@ -380,7 +380,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
 ):
     """In this process, in which the daemon's objects can be counted and its record taken away."""
     config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
-    texts = {"config.yaml": laboratory.read_text(), "target.yaml": packaged("targets", config.target).read_text()}
+    texts = {"config.yaml": laboratory.read_text(), "target.yaml": find_packaged("targets", config.target).read_text()}
     subscribers: list[int] = []
     told: set[str] = set()
 
@@ -390,7 +390,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
             hub.publish(Event(clock.now_ns(), "info", "tick", str(number)))
             await asyncio.sleep(0.02)
 
-    of_other_tests = {id(found) for found in gc.get_objects() if isinstance(found, Guest)}  # whose failures hold them
+    of_other_tests = {id(found) for found in gc.get_objects() if isinstance(found, Run)}  # whose failures hold them
 
     async def until(desk: StandService, wanted: Callable[[StandState], bool]) -> None:
         end_s = time.monotonic() + LIMIT_S
@@ -410,7 +410,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
                 await until(desk, is_idle)
                 subscribers.append(len(getattr(hub, "_subscribers")))  # noqa: B009 - as above
             gc.collect()
-            left = [found for found in gc.get_objects() if isinstance(found, Guest)]
+            left = [found for found in gc.get_objects() if isinstance(found, Run)]
             assert [found for found in left if id(found) not in of_other_tests] == []
             del left
             telling.cancel()

@@ -15,9 +15,9 @@ from tests.stand.alert_receiver import Receiver
 from tests.system.daemon_here import DaemonHere, served_here, until
 from thermostand.foundation.items import Event
 from thermostand.stand.config.stand_config import load_config
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve as serve_clients
-from thermostand.stand.serving.client import server_of
+from thermostand.stand.serving.client import find_session_server
 
 WATCHDOG_S = 1.5
 
@@ -62,7 +62,7 @@ async def test_a_receiver_that_hangs_delays_neither_guard_nor_door_nor_watchdog(
         end_s = time.monotonic() + 3 * WATCHDOG_S
         while time.monotonic() < end_s:
             began_s = time.monotonic()
-            await asyncio.to_thread(server_of(out).state, 20.0)
+            await asyncio.to_thread(find_session_server(out).state, 20.0)
             if (took_s := time.monotonic() - began_s) > 2.0 or not daemon.open_stand.guard.is_on_time:
                 late.append(f"{took_s:.1f} s")
             await asyncio.sleep(0.1)

@@ -19,13 +19,13 @@ from tests.system.test_run_ends import SHORTER
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.items import StepState
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
-from thermostand.recording.reading.run_word import Files, RunOutcome
+from thermostand.recording.reading.run_status import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session, open_whole
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.stand.running.memory.entries import Tripped
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 
@@ -49,7 +49,7 @@ async def test_a_stopped_run_goes_on_without_the_first_line_of_its_journal_and_o
     assert (scan(directory).run, verify(directory).files) == (RunOutcome.STOPPED, Files.SOUND)
     count = flip(directory, 0, 2, -1)
     assert (verify(directory).run, verify(directory).files) == (RunOutcome.STOPPED, Files.DAMAGED)
-    before = await asyncio.to_thread(interruption, directory)
+    before = await asyncio.to_thread(load_interruption, directory)
     assert before.seed == 7
     await resume(before, ignore)
     session, plan = Session.open(directory), tuple(ordered.recipe.plan())
@@ -70,7 +70,7 @@ async def test_a_run_whose_end_its_journal_has_lost_is_ended_by_the_recording(
     flip(copy, -1)
     assert (scan(copy).run, verify(copy).files) == (RunOutcome.COMPLETE, Files.DAMAGED)
     with pytest.raises(SessionError, match="its run is complete"):
-        await asyncio.to_thread(interruption, copy)
+        await asyncio.to_thread(load_interruption, copy)
     info = [event.data for event in Session.open(directory).events() if event.kind == "run.start"]
     assert [(data["steps"], data["frames"]) for data in info] == [
         (len(tuple(order(SHORTER).recipe.plan())), Session.open(directory).frame_count)
@@ -110,12 +110,12 @@ async def test_a_trip_that_the_journal_has_lost_still_wants_an_operator(tmp_path
     copy = Path(shutil.copytree(directory, tmp_path / "copy"))
     (copy / JOURNAL_NAME).write_bytes(b"".join(lines[:last]))  # as a disk that has lost its last flushes
     with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --reset"):
-        await asyncio.to_thread(interruption, copy)
+        await asyncio.to_thread(load_interruption, copy)
     flip(directory, -1, *(number for number, entry in enumerate(entries) if isinstance(entry, Tripped)))
     assert (verify(directory).run, verify(directory).files) == (RunOutcome.TRIPPED, Files.DAMAGED)
     for _ in range(2):  # also when the last line has been cut off
         with pytest.raises(SessionError, match=r"the stand tripped: .* then resume with --reset"):
-            await asyncio.to_thread(interruption, directory)
-    before = await asyncio.to_thread(partial(interruption, directory, reset=True))
+            await asyncio.to_thread(load_interruption, directory)
+    before = await asyncio.to_thread(partial(load_interruption, directory, reset=True))
     assert before.state.tripped
     before.release()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.stand.chamber.keeper import SUPERVISED_S
+from thermostand.stand.chamber.permit_renewer import SUPERVISION_PERIOD_S
 from thermostand.stand.config.guard_section import GuardConfig
 from thermostand.stand.guarding.guard import LATE_PERIODS
 
@@ -17,7 +17,7 @@ TIMES_S = {
     "RENEW": GUARD.heater_renew_s,
     "LATE": LATE_PERIODS * GUARD.period_s,
     "STALE": GUARD.stale_after_s,
-    "LOOK": SUPERVISED_S,
+    "LOOK": SUPERVISION_PERIOD_S,
     "BUS": 1.0,  # three tries of 0.3 s (drivers/wires/modbus_client.py, bus.py)
 }
 BOUND_S = 33

@@ -18,9 +18,9 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.journals import read_lines
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from tests.recording.damage import read_segment
-from tests.recording.declared import declared
+from tests.recording.device_declarations import declare_devices
 from tests.system.disk_faults import KINDS, kind_of, put_back, states, tree_of
 from tests.system.test_kill_recording import read_series
 from thermostand.foundation.clock import NS_PER_S, Boot, VirtualClock
@@ -34,19 +34,19 @@ from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.reading.notes import add_note, add_tags, read_notes
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.recording.writing.recorder_settings import RecordingSettings
-from thermostand.stand.chamber.compressor import CompressorState, keep, restored
+from thermostand.stand.chamber.compressor import CompressorState, load_state, save_state
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.learned import Learned, load_learned
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.estimating.learned_durations import LearnedDurations, load_learned_durations
 from thermostand.stand.fault import Fault
 from thermostand.stand.running.memory.entries import Ended, Held, Soaked, StepChanged, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
-from thermostand.stand.running.opening.claim import latch_file
+from thermostand.stand.running.opening.stand_lock import find_latch_file
 from thermostand.stand.running.order import load_order
-from thermostand.stand.running.resume import begun, interruption
+from thermostand.stand.running.resume import load_interruption, make_begin_entry
 from thermostand.stand.service import queue
-from thermostand.stand.service.daemon_file import KeptCounters, kept_in
+from thermostand.stand.service.counters import StoredCounters, load_counters
 
 START_NS = 1_767_290_400 * NS_PER_S
 TRIPPED, KILLED = "20260101T180000Z-tripped", "20260102T180000Z-killed"
@@ -89,13 +89,13 @@ async def recorded(directory, order, start_ns, each_second):
     """A run in `directory`, killed unless it trips; `each_second` is called after each."""
     name, clock, hub = directory.name, VirtualClock(start_ns), Hub()
     info = SessionInfo(name, "demo", "DA1234567", "M. Adamczyk", "0.1.0", "virtual", simulated=True)
-    devices = declared({"thermometers": "thermometers", "camera": "camera"})
+    devices = declare_devices({"thermometers": "thermometers", "camera": "camera"})
     recorder = Recorder(directory, info, order.attachments(), devices, hub, clock, settings=SETTINGS)
     recorder.start()
     journal = Journal.create(directory)
     journal.start(clock, print)
     tasks = [asyncio.create_task(recorder.run()), asyncio.create_task(clock.run())]
-    await journal.write(begun(order, name, start_ns, 7))
+    await journal.write(make_begin_entry(order, name, start_ns, 7))
     for index in range(SECONDS):
         await clock.sleep_until(start_ns + index * NS_PER_S)
         for item in items(order, index, clock.now_ns(), name):
@@ -121,7 +121,7 @@ class Stand:
     def __init__(self, root: Path) -> None:
         self.root, self.sessions, self.tokens = root, root / "sessions", root / "tokens.yaml"
         self.order = load_order("demo", "simulated")
-        self.latch = latch_file(load_config(packaged("", "simulated")))
+        self.latch = find_latch_file(load_config(find_packaged("", "simulated")))
         self.before = []
         self.sessions.mkdir(parents=True)
         for number in range(4):
@@ -153,20 +153,22 @@ class Stand:
 
     def keep(self, number):
         """Change each small file once more."""
-        queue.append(self.sessions, queue.entry_of(self.order, "simulated", START_NS + number))
+        queue.append(self.sessions, queue.make_entry(self.order, "simulated", START_NS + number))
         if number == 2:
             queue.take(self.sessions, START_NS + number)
-        keep(self.sessions / "compressor.json", compressor(number), BOOT)
+        save_state(self.sessions / "compressor.json", compressor(number), BOOT)
         counters = {f"relay_cycles.{n}": float(7**number + n) for n in range(20)}
-        self.write(self.sessions / "daemon.json", "counters", KeptCounters(counters=counters))
-        learned = Learned(overheads_s={f"soak {n}": float(5**number + n) for n in range(20)}, nights=(str(number),))
+        self.write(self.sessions / "daemon.json", "counters", StoredCounters(counters=counters))
+        learned = LearnedDurations(
+            overheads_s={f"soak {n}": float(5**number + n) for n in range(20)}, nights=(str(number),)
+        )
         self.write(self.sessions / "learned.json", "learned", learned)
         write_tokens(self.tokens, tokens(number))
         if number == 1:
             self.latch.keep(Fault("flap_open", "open"), 5)
         self.snap()
         if number == 2:
-            self.latch.forget()
+            self.latch.remove()
 
     def write(self, path, kind, model):
         path.write_bytes(seal(kind, model.model_dump_json(indent=1)))
@@ -248,18 +250,18 @@ def small_files(stand, state, names):
         yield "the latch is lost: the stand would heat"
     elif not any(name.endswith(".latched.json") for name in names) and fault.text != "too hot":
         yield "a latch that is not damaged is not read"
-    found = restored(stand.sessions / "compressor.json", NOW_NS, BOOT)
+    found = load_state(stand.sessions / "compressor.json", NOW_NS, BOOT)
     true = compressor(4) if "compressor.json" not in names else None
     earlier = [compressor(n) for n in range(4)] if "sessions/compressor.json" in state.gone_back else []
     unknown = CompressorState(False, NOW_NS)
     if found not in ([true] if true else [unknown, compressor(4), *earlier]):
         yield f"compressor {found}"
-    kept, damage = kept_in(stand.sessions)
+    kept, damage = load_counters(stand.sessions)
     if not damage and kept.counters not in counted(4, "sessions/daemon.json", state):
         yield "counters are wrong and nothing says so"
     if damage and "daemon.json" not in names:
         yield "sound counters are blamed"
-    learned = load_learned(stand.sessions)
+    learned = load_learned_durations(stand.sessions)
     if learned.nights not in [("4",), *([(), ("3",)] if "learned.json" in names else [])]:
         yield f"learned {learned.nights}"
     if learned.nights == ("4",) and learned.overheads_s != {f"soak {n}": float(625 + n) for n in range(20)}:
@@ -282,7 +284,7 @@ def counted(number, name, state):
 def queued(stand, names):
     its = names & {"queue.json", "queue.json.last"}
     try:
-        runs = [(entry.id, entry.state.value) for entry in queue.queued(stand.sessions).entries]
+        runs = [(entry.id, entry.state.value) for entry in queue.load_queue(stand.sessions).entries]
     except SessionError as error:
         if not its:
             yield "a sound queue is blamed"
@@ -359,7 +361,7 @@ def journalled(stand, name, directory, hit):
     if path.exists() and not all(entry in true for entry in read_lines(path.read_bytes())[0]):
         yield f"journal of {name}: entries count that were never written there, or are out of order"
     try:
-        before = interruption(directory)
+        before = load_interruption(directory)
     except SessionError as error:
         if name == TRIPPED and not hit and "tripped" not in str(error):
             yield f"resume: {error}"
@@ -381,7 +383,7 @@ def judge(stand, chosen):
     return tried, found
 
 
-@pytest.mark.parametrize("seeds", [range(BY_DAY), by_night(range(BY_DAY, BY_NIGHT))])
+@pytest.mark.parametrize("seeds", [range(BY_DAY), mark_nightly(range(BY_DAY, BY_NIGHT))])
 def test_what_the_disk_has_spoilt_is_named_and_the_rest_is_as_it_was(stand, seeds):
     tried, found = judge(stand, states(stand.before, stand.now, seeds))
     assert found == []

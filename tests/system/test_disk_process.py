@@ -14,7 +14,7 @@ import pytest
 from tests.journals import read_lines
 from tests.recording.disks import ext4, run
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.reading.gaps import reported_blocks
+from thermostand.recording.reading.gaps import list_reported_blocks
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.recording.writing import locks
@@ -104,7 +104,7 @@ def recorded(directory):
     """The numbers of the frames that are in the session, and of those that it says were lost."""
     salvage_session(directory)
     session = Session.open(directory)
-    lost = {block for blocks in reported_blocks(session.events()) for block in blocks}
+    lost = {block for blocks in list_reported_blocks(session.events()) for block in blocks}
     return [frame.block_id for frame in session.frames()], lost
 
 

@@ -18,19 +18,19 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from tests.addresses import free_port
+from tests.addresses import find_free_port
 from tests.installed import install
-from tests.stand.a_desk import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.compensation.cli import app as compensate
-from thermostand.compensation.datasheet.details import Details
-from thermostand.experiments.steps import step_of
+from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
+from thermostand.experiments.steps import make_step
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.events import GUARD, KINDS
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.config.alerts_section import AlertSecrets
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.serving.api.doors import Interface
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
+from thermostand.stand.serving.api.listeners import Interface
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -146,12 +146,12 @@ def test_what_is_written_in_a_file_is_taken(block: Block):
     elif "urls" in data:
         parse_document(block.text, AlertSecrets, name)
     elif "lens" in data:
-        parse_document(block.text, Details, name)
+        parse_document(block.text, MeasurementDetails, name)
     elif "scrape_configs" in data:  # Prometheus'
         assert data["scrape_configs"][0]["static_configs"]
     else:
         whole = next((WHOLE[section] for section in data if section in WHOLE), "laboratory")
-        base = yaml.safe_load(packaged("", whole).read_text("utf-8"))
+        base = yaml.safe_load(find_packaged("", whole).read_text("utf-8"))
         for section in data:
             for other in INSTEAD.get(section, ()):
                 base.pop(other, None)
@@ -165,7 +165,7 @@ def test_what_is_written_in_a_file_is_taken(block: Block):
 def test_json_is_what_the_interface_takes_or_gives(block: Block):
     data = json.loads(block.text)
     for step in data.get("steps", ()):
-        assert step_of(step["kind"], step["parameters"]).kind == step["kind"]
+        assert make_step(step["kind"], step["parameters"]).kind == step["kind"]
 
 
 PYTHON = {
@@ -183,8 +183,8 @@ async def test_the_http_client_of_the_page_reads_and_commands(tmp_path: Path):
     import asyncio
 
     (block,) = blocks_named("http-api.md")
-    port = free_port()
-    async with served(ADesk(), tmp_path / "now", Interface(tmp_path, port=port)):
+    port = find_free_port()
+    async with serve_fake(FakeService(), tmp_path / "now", Interface(tmp_path, port=port)):
         code = compile(block.text.replace("127.0.0.1:8000", f"127.0.0.1:{port}"), "http-api.md", "exec")
         await asyncio.to_thread(exec, code, {})
 

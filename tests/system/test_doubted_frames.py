@@ -9,9 +9,9 @@ from tests.system.test_run_ends import break_now
 from thermostand.compensation.observations import observe
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Item, StepMark, StepState
-from thermostand.foundation.readings import TEMPERATURE_IN_DOUBT, Quality
-from thermostand.recording.exporting.export import frames_rows
-from thermostand.recording.reading.overview import overview
+from thermostand.foundation.readings import TEMPERATURE_SUSPECT, Quality
+from thermostand.recording.exporting.export import make_frames_rows
+from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
@@ -50,15 +50,15 @@ async def test_frames_of_a_camera_that_is_wrong_at_each_capture_say_so(tmp_path:
     session = Session.open(path)
     flags = [(meta.step_id != captures[0], meta.flags) for meta in session.frame_metas()]
     assert [flag for is_wrong, flag in flags if not is_wrong] == [()]
-    assert {flag for is_wrong, flag in flags if is_wrong} == {(TEMPERATURE_IN_DOUBT,)}
+    assert {flag for is_wrong, flag in flags if is_wrong} == {(TEMPERATURE_SUSPECT,)}
     count = sum(is_wrong for is_wrong, _ in flags)
     assert count >= 2
     assert [frame.flags for frame in session.frames()] == [flag for _, flag in flags]
-    assert Counter(session.frames_table().flags.tolist())[TEMPERATURE_IN_DOUBT] == count
-    assert overview(path).frames.flagged == {TEMPERATURE_IN_DOUBT: count}
-    columns, rows = frames_rows(session, None)
+    assert Counter(session.frames_table().flags.tolist())[TEMPERATURE_SUSPECT] == count
+    assert summarise_session(path).frames.flagged == {TEMPERATURE_SUSPECT: count}
+    columns, rows = make_frames_rows(session, None)
     place = [column.name for column in columns].index("flags")
-    assert Counter(row[place] for row in rows)[TEMPERATURE_IN_DOUBT] == count
+    assert Counter(row[place] for row in rows)[TEMPERATURE_SUSPECT] == count
     said = Counter(event.kind for event in session.events() if "channels" in event.data)
     assert said == {"guard.sensor_jumped": len(captures) - 1, "sensor_believed": len(captures) - 1}
     wrong_ns = {

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import evaluate
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.model_selection import fit
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import Role
 from thermostand.foundation.hub import Hub
@@ -86,7 +86,7 @@ async def record(order: Order, out: Path) -> Seen:
 
 def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: NDArray[np.float64]) -> float:
     observed, truth_px = seen
-    states = frame_states(observed, model.memory)
+    states = compute_frame_states(observed, model.memory)
     frames = np.flatnonzero(observed.of(role)).tolist()
     left = [reference_px - model.correct(truth_px[k], states.where(np.array([k]))) for k in frames]
     return 1e3 * float(np.sqrt(np.mean(np.square(left))))

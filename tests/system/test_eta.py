@@ -13,12 +13,12 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.estimating.estimate import price
+from thermostand.stand.config.stand_config import find_packaged
+from thermostand.stand.estimating.estimate import price_plan
 from thermostand.stand.estimating.eta import Eta
-from thermostand.stand.estimating.learned import learn, load_learned
+from thermostand.stand.estimating.learned_durations import learn_durations, load_learned_durations
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 
@@ -56,7 +56,7 @@ def following(eta: Eta) -> tuple[Callable[[Hub], None], list[tuple[int, float]]]
 
 async def followed(order: Order, out: Path, seed: int | None = None) -> tuple[Path, list[tuple[int, float]]]:
     """The session, and the time left as `following` has it, by what earlier runs in that folder have taught."""
-    steps = price(order.recipe.plan(), order.config, load_learned(out))
+    steps = price_plan(order.recipe.plan(), order.config, load_learned_durations(out))
     watch, left = following(Eta(steps))
     return await run_virtual(order, out, seed, watch), left
 
@@ -81,10 +81,10 @@ async def test_the_time_left_is_true_from_the_first_set_point_on(tmp_path: Path,
     assert len(left) > 100
     assert worst_share(left, session) < 0.05
 
-    learned = learn(tmp_path, ordered.config)
+    learned = learn_durations(tmp_path, ordered.config)
     steps = Session.open(session).steps()
     truth_s = (steps[-1].time_ns - steps[0].time_ns) / NS_PER_S
-    plan = price(ordered.recipe.plan(), ordered.config, learned)
+    plan = price_plan(ordered.recipe.plan(), ordered.config, learned)
     assert sum(step.duration_s for step in plan) == pytest.approx(truth_s, abs=0.5)
     assert (learned.chamber.heating_ramps, learned.chamber.cooling_ramps) == (2, 1)
     arrivals_s = [step.in_band_after_s for step in plan if step.planned.index > 6 and step.in_band_after_s is not None]
@@ -103,8 +103,8 @@ async def test_the_time_left_of_a_run_that_goes_on_is_true(tmp_path: Path, order
     with pytest.raises(Interrupted):
         await run_virtual(ordered, tmp_path / "out", None, lambda hub: hub.subscribe(stop))
     (directory,) = (tmp_path / "out").iterdir()
-    before = interruption(directory)
-    steps = price(ordered.recipe.plan(), ordered.config)
+    before = load_interruption(directory)
+    steps = price_plan(ordered.recipe.plan(), ordered.config)
     done, soaked_s = before.kept.done, before.kept.soaked_s
     watch, left = following(Eta(steps, done, soaked_s))
     await resume(before, watch)
@@ -122,7 +122,7 @@ async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_
     settled = "soak_s: 3600\n      until: {settled: {drift_px_per_min: 0.0034}}"
     ordered = order(recipe.replace("soak_s: 600", settled))
     await followed(ordered, tmp_path, 3)
-    learn(tmp_path, ordered.config)
+    learn_durations(tmp_path, ordered.config)
     session, left = await followed(ordered, tmp_path, 4)
     assert len(left) > 100
     assert is_true(left, session, 60.0)
@@ -130,14 +130,14 @@ async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_
 
 @pytest.mark.nightly
 async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, order: Callable[..., Order]):
-    session, left = await followed(order(packaged("recipes", "demo").read_text(), camera=CORNER), tmp_path)
+    session, left = await followed(order(find_packaged("recipes", "demo").read_text(), camera=CORNER), tmp_path)
     assert len(left) > 10_000
     assert worst_share(left, session) < 0.05
 
 
 def test_no_time_is_gained_in_a_pause(order: Callable[..., Order]):
     ordered = order()
-    steps = price(ordered.recipe.plan(), ordered.config)
+    steps = price_plan(ordered.recipe.plan(), ordered.config)
     eta = Eta(steps)
     follow = fed(eta)
     soak = next(step.planned for step in steps if isinstance(step.planned.step, Soak))

@@ -14,20 +14,20 @@ from typing import Any
 
 import pytest
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from tests.system.conftest import SHORT_RECIPE
 from tests.system.simulated_orders import simulated_order
 from thermostand.drivers.wires import camera_connection
-from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, to_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Quality, Reading
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.simulated_faults import break_or_mend, simulated_faults
-from thermostand.stand.serving.desk import FaultRequest, Missing
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
+from thermostand.stand.running.simulated_faults import break_or_mend, list_simulated_faults
+from thermostand.stand.serving.api_models import FaultRequest, Missing
+from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 PERIOD_S = 1.0
 OTHERS = ("regulator.pv", "thermometers.air", "relays.heater_enable", "linear.position", "flap.position")
@@ -95,11 +95,11 @@ ROWS = (
 # What ends a grab, and how: lost until the camera is opened again.
 CAMERA_LOST = (
     "camera.silent",
-    by_night("camera.deaf"),
+    mark_nightly("camera.deaf"),
     "camera.stalled",
-    by_night("camera.restart"),
+    mark_nightly("camera.restart"),
     "camera.control_lost",
-    by_night("camera.power"),
+    mark_nightly("camera.power"),
 )
 
 
@@ -108,7 +108,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Order]:
     order = simulated_order(tmp_path_factory.mktemp("laboratory"), SHORT_RECIPE, poll_s=PERIOD_S)
     bus = order.config.bus.model_copy(update={"timeout_s": 0.1})
     order = _with(order, bus=bus)
-    simulator = Simulator(laboratory_of(order.config, virtual=True, seed=None))
+    simulator = Simulator(describe_laboratory(order.config, virtual=True, seed=None))
     yield order
     simulator.stop()
 
@@ -139,7 +139,7 @@ class Watched:
         while not is_so():
             took_s = (self.clock.now_ns() - begin_ns) / NS_PER_S
             assert took_s <= within_s, f"not within {within_s} s: {what}; {self.latest}"
-            await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(0.25))
+            await self.clock.sleep_until(self.clock.now_ns() + to_ns(0.25))
         return (self.clock.now_ns() - begin_ns) / NS_PER_S
 
 
@@ -180,12 +180,12 @@ async def watched(order: Order, devices: tuple[str, ...]) -> AsyncGenerator[Watc
         for device in opened:
             if device is assembly.devices.cameras["camera"]:
                 await assembly.devices.relays.switch("camera_power", on=True)
-                await clock.sleep_until(clock.now_ns() + seconds_ns(5.0))
+                await clock.sleep_until(clock.now_ns() + to_ns(5.0))
             await device.open()
             if device is assembly.devices.axes.get("linear"):
                 await device.home()
                 await device.move_to(1.0)
-        for poller in assembly.pollers():
+        for poller in assembly.make_pollers():
             if poller.sensor in opened:
                 await poller.first()
                 tasks.append(asyncio.create_task(poller.run()))
@@ -259,7 +259,7 @@ async def others_keep_their_rate(stand: Watched, row: Row, device: str) -> None:
         and not (is_shared and channel.partition(".")[0] in on_bus)
     ]
     before = dict(stand.counts)
-    await stand.clock.sleep_until(stand.clock.now_ns() + seconds_ns(5 * PERIOD_S + 0.5))
+    await stand.clock.sleep_until(stand.clock.now_ns() + to_ns(5 * PERIOD_S + 0.5))
     for channel in others:
         assert stand.counts[channel] - before[channel] >= 5, channel
         assert stand.latest[channel].quality is GOOD, channel
@@ -278,11 +278,11 @@ async def test_a_camera_that_gives_no_frame_is_lost_and_returns_with_its_setting
         read = stand.counts["thermometers.air"]
         with pytest.raises(Unreachable):
             await camera.grab()
-        await stand.clock.sleep_until(stand.clock.now_ns() + seconds_ns(3 * PERIOD_S + 0.5))
+        await stand.clock.sleep_until(stand.clock.now_ns() + to_ns(3 * PERIOD_S + 0.5))
         assert stand.counts["thermometers.air"] - read >= 3
         assert stand.latest["thermometers.air"].quality is GOOD
         await broken(stand, name, False)
-        await stand.clock.sleep_until(stand.clock.now_ns() + seconds_ns(5.0))  # its boot
+        await stand.clock.sleep_until(stand.clock.now_ns() + to_ns(5.0))  # its boot
         await camera.open()
         frame = await camera.grab()
         assert frame.exposure_s == pytest.approx(camera.settings.exposure_s)
@@ -293,20 +293,20 @@ async def test_what_an_operator_breaks_on_the_page_is_broken_for_that_long(labor
     async with watched(laboratory, ("thermometers",)) as stand:
         text = await break_or_mend(stand.assembly, FaultRequest(name="thermometer.open", value="air", for_s=5.0))
         assert text == "thermometer.open is broken for 5 s"
-        known = await simulated_faults(stand.assembly)
+        known = await list_simulated_faults(stand.assembly)
         assert {fault.name for fault in known.faults} > {"thermometer.open", "bus.drop", "camera.restart"}
         assert known.standing == {"thermometer.open": "air"}
         await stand.until(lambda: stand.latest["thermometers.air"].quality is BAD, 2.0, "it is open")
         await stand.until(lambda: stand.latest["thermometers.air"].quality is GOOD, 5.0, "its time is over")
-        assert (await simulated_faults(stand.assembly)).standing == {}
+        assert (await list_simulated_faults(stand.assembly)).standing == {}
         await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits", for_s=2.0))
         await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits", mend=True))
         await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits"))
-        await stand.clock.sleep_until(stand.clock.now_ns() + seconds_ns(3.0))  # the first one's end is no end of this
-        assert (await simulated_faults(stand.assembly)).standing == {"thermometers.no_fault_bits": True}
+        await stand.clock.sleep_until(stand.clock.now_ns() + to_ns(3.0))  # the first one's end is no end of this
+        assert (await list_simulated_faults(stand.assembly)).standing == {"thermometers.no_fault_bits": True}
         await break_or_mend(stand.assembly, FaultRequest(name="thermometers.no_fault_bits", mend=True))
         await break_or_mend(stand.assembly, FaultRequest(name="relays.brown_out"))  # which just happens
-        assert (await simulated_faults(stand.assembly)).standing == {}
+        assert (await list_simulated_faults(stand.assembly)).standing == {}
         for name, value, error in (("bus.dorp", 1.0, Missing), ("thermometer.open", "cellar", ConfigError)):
             with pytest.raises(error, match=name):
                 await break_or_mend(stand.assembly, FaultRequest(name=name, value=value))

@@ -18,7 +18,7 @@ from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.foundation.readings import UNSETTLED
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 RECIPE = """
@@ -131,7 +131,7 @@ async def test_a_run_that_is_interrupted_while_a_soak_goes_on_ends_it_in_the_ban
     with pytest.raises(Interrupted):
         await run_virtual(order(RECIPE % "330"), tmp_path / "out", None, lambda hub: hub.subscribe(stop))
     (directory,) = (tmp_path / "out").iterdir()
-    session = Session.open(await resume(interruption(directory), unwatched))
+    session = Session.open(await resume(load_interruption(directory), unwatched))
     _, end_ns = last_soak_ns(session)
     assert off_K(session, end_ns - 110_000_000_000, end_ns) <= BAND_K
     assert [meta.flags for meta in session.frame_metas()] == [(), ()]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask_status
+from tests.daemon_queries import ask_status
 from tests.recording.disks import ext4, run
 from tests.stand.test_listening import STATE, connected
 from tests.system.test_run import fault

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask, ask_status
+from tests.daemon_queries import ask, ask_status
 from tests.journals import read_lines
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from tests.system.conftest import AS_INSTALLED
 from tests.system.test_guard_wire import write_by_another_master
 from tests.system.test_run import at_step, fault
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
@@ -26,7 +26,7 @@ from thermostand.stand.config.alerts_section import AlertsConfig
 from thermostand.stand.running.memory.entries import Reset, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, run_virtual
 
 POLLED = AS_INSTALLED
@@ -67,7 +67,7 @@ class Watcher:
     async def event(self, kind: str, within_s: float) -> Event:
         """The next event of that kind, forgotten with those before it."""
         await self.until(lambda: self.now_ns > 0)
-        limit_ns = self.now_ns + seconds_ns(within_s)
+        limit_ns = self.now_ns + to_ns(within_s)
         await self.until(lambda: kind in {event.kind for event in self.events} or self.now_ns > limit_ns)
         kinds = [event.kind for event in self.events]
         assert kind in kinds, f"{kind} did not come within {within_s} s: {kinds}"
@@ -76,7 +76,7 @@ class Watcher:
         return found
 
     async def wait(self, duration_s: float) -> None:
-        end_ns = self.now_ns + seconds_ns(duration_s)
+        end_ns = self.now_ns + to_ns(duration_s)
         await self.until(lambda: self.now_ns >= end_ns)
 
 
@@ -150,7 +150,7 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
     supply = session.readings("relays.camera_power")[1][-1]
     assert supply == (0 if name == "camera.sensor_degC" else 1)  # one that is too warm itself is switched off
     with pytest.raises(SessionError, match=r"tripped: .*resume with --reset"):
-        interruption(directory)
+        load_interruption(directory)
 
 
 async def run_operated(order: Order, out: Path, watcher: Watcher, operate: Coroutine[None, None, None]) -> None:
@@ -183,7 +183,7 @@ BY_DAY = {"set point by hand", "lost writes"}
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in BY_DAY else by_night(name) for name in TO_BE_PUT_RIGHT], ids=list(TO_BE_PUT_RIGHT)
+    "name", [name if name in BY_DAY else mark_nightly(name) for name in TO_BE_PUT_RIGHT], ids=list(TO_BE_PUT_RIGHT)
 )
 async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
     tmp_path: Path, order: Callable[..., Order], name: str

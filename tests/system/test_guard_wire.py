@@ -16,15 +16,15 @@ from typing import Any
 import pytest
 
 from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE
-from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, WallClock, block_until, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import Assembly, assemble
-from thermostand.stand.chamber.compressor import CompressorState, keep
-from thermostand.stand.config.stand_config import CompressorConfig, StandConfig, packaged
+from thermostand.stand.chamber.compressor import CompressorState, save_state
+from thermostand.stand.config.stand_config import CompressorConfig, StandConfig, find_packaged
 from thermostand.stand.fault import Fault
-from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.guarding.rules import Announcements, make_watches
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import ControlSocket, Simulator
@@ -55,16 +55,16 @@ class Bench:
             return float(str((await self.control.request({"do": "state"}))[quantity]))
 
     async def wait(self, duration_s: float) -> None:
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
 
     async def start(self, chamber_degC: float, soak_s: float) -> None:
         """A chamber in good order, guarded by a guard with no memory of what was."""
         self.trips.clear()
-        guard = self.assembly.guard(self.trips.append, self.trips.append)
+        guard = self.assembly.make_guard(self.trips.append, self.trips.append)
         assert guard.look()
         self.guarding = [
             asyncio.create_task(guard.run()),
-            asyncio.create_task(self.assembly.stand.chamber.keeper.run()),
+            asyncio.create_task(self.assembly.stand.chamber.permit_renewer.run()),
         ]
         await self.assembly.stand.chamber.start(chamber_degC)
         await self.wait(soak_s)
@@ -73,7 +73,7 @@ class Bench:
 
     async def tripped(self, within_s: float) -> Fault:
         """The trip that comes within that time, after which heat is off at the plant and the flap closed."""
-        end_ns = self.clock.now_ns() + seconds_ns(within_s)
+        end_ns = self.clock.now_ns() + to_ns(within_s)
         while not self.trips:
             assert self.clock.now_ns() < end_ns, f"no trip within {within_s} s"
             await self.wait(5)
@@ -87,7 +87,7 @@ class Bench:
 
     async def make_safe(self) -> None:
         self.assembly.stand.safety.demand()
-        assert await self.assembly.stand.safety.confirmed(60)
+        assert await self.assembly.stand.safety.wait_until_confirmed(60)
 
     async def end(self) -> None:
         await _cancel(self.guarding)
@@ -105,7 +105,7 @@ async def bench_of(order: Order, start: Start) -> AsyncIterator[Bench]:
     simulation = order.config.simulation
     assert simulation is not None
     await asyncio.to_thread(start, order.config, True)
-    async with bench_from(order, seconds_ns(simulation.start.timestamp())) as bench:
+    async with bench_from(order, to_ns(simulation.start.timestamp())) as bench:
         yield bench
 
 
@@ -143,7 +143,7 @@ async def bench_from(order: Order, start_ns: int | None) -> AsyncIterator[Bench]
         await devices.thermometers.open()
         await devices.regulator.stop()
         await devices.flap.move_closed()
-        pollers = [poller for poller in assembly.pollers() if poller.sensor is not devices.cameras["camera"]]
+        pollers = [poller for poller in assembly.make_pollers() if poller.sensor is not devices.cameras["camera"]]
         for poller in pollers:
             await poller.first()
         tasks.extend(asyncio.create_task(poller.run()) for poller in pollers)
@@ -297,8 +297,8 @@ async def test_what_somebody_left_switched_on_is_switched_off_and_reported_befor
     ordered, state_file = order(), tmp_path / "compressor.json"
     simulation = ordered.config.simulation
     assert simulation is not None
-    start_ns = seconds_ns(simulation.start.timestamp())
-    keep(state_file, CompressorState(False, start_ns - seconds_ns(7200)), boot=None)
+    start_ns = to_ns(simulation.start.timestamp())
+    save_state(state_file, CompressorState(False, start_ns - to_ns(7200)), boot=None)
     compressor = CompressorConfig(state_file=state_file)
     ordered = replace(ordered, config=ordered.config.model_copy(update={"compressor": compressor}))
     await asyncio.to_thread(simulator, ordered.config, True)
@@ -312,7 +312,7 @@ async def test_what_somebody_left_switched_on_is_switched_off_and_reported_befor
         await asyncio.to_thread(write_by_another_master, ordered, unit, function, address, value)
     async with bench_from(ordered, start_ns) as bench:
         assert (await bench.plant("heater_enabled"), await bench.plant("compressor_on")) == (1, 1)
-        await bench.assembly.stand.chamber.permits.withdraw_left_on()
+        await bench.assembly.stand.chamber.permits.switch_off_left_on()
         assert (await bench.plant("heater_enabled"), await bench.plant("compressor_on")) == (0, 0)
         left = [event.text for event in bench.events if event.kind == "left_on"]
         assert left == [f"relays.{name} was on; switched off" for name in ("compressor", "heater_enable")]
@@ -347,7 +347,7 @@ async def test_a_daemon_whose_event_loop_is_held_up_does_not_heat(order: Callabl
         await bench.start(26, 0.5)
         asking = asyncio.ensure_future(asyncio.to_thread(first_seen_off_s, simulation.control, bench.clock, 4.0))
         await asyncio.sleep(0)
-        block_until(bench.clock, bench.clock.now_ns() + seconds_ns(3.0))
+        block_until(bench.clock, bench.clock.now_ns() + to_ns(3.0))
         assert await asking < 3.0
         await bench.wait(0.5)
         assert "guard_late" in {event.kind for event in bench.events}
@@ -358,7 +358,7 @@ async def test_a_daemon_whose_event_loop_is_held_up_does_not_heat(order: Callabl
 
 NIGHTS = [
     pytest.param(SHORT_RECIPE.replace("600", "300"), id="short"),
-    pytest.param(packaged("recipes", "demo").read_text(), id="demo", marks=pytest.mark.nightly),
+    pytest.param(find_packaged("recipes", "demo").read_text(), id="demo", marks=pytest.mark.nightly),
 ]
 
 
@@ -372,9 +372,9 @@ async def test_a_good_night_trips_nothing_and_warns_of_nothing(
     assert [event.text for event in session.events() if event.kind.startswith("guard.")] == []
     hub, announced = Hub(), Announcements()
     hub.subscribe(announced.receive)
-    rules = watches(ordered.config, announced)
+    rules = make_watches(ordered.config, announced)
     items = session.items()
-    looked_ns = next(items).time_ns + seconds_ns(10)  # by then every device has been read
+    looked_ns = next(items).time_ns + to_ns(10)  # by then every device has been read
     for item in items:
         while looked_ns < item.time_ns:
             assert [fault for watch in rules if (fault := watch.check(hub, looked_ns)) is not None] == []

@@ -25,7 +25,7 @@ POLLED = AS_INSTALLED
 TESTS, ROOM = Path(__file__).parents[1], Path(stand.__file__).parent
 PHASES_S = (0.0, 1.5, 3.5)  # between the fault and the polls, which come each 5 s
 _LOOK_S = 0.5
-_PLACES = {"Fault": 0, "_Row": 2}
+_PLACES = {"Fault": 0, "_ErrorRule": 2}
 """Where a rule's name stands among the arguments: of a fault, and of the table of errors that steps have met."""
 _APART_S = 1.0  # virtual time repeats; two looks are for another order of what is due at one instant
 

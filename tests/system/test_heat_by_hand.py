@@ -10,9 +10,9 @@ from tests.system.daemon_here import DaemonHere, served_here, until
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import bad_reading
 from thermostand.recording.reading.session import Session
-from thermostand.stand.service.day_record import DayRecord
+from thermostand.stand.service.idle_log import IdleLog
 from thermostand.stand.service.stand_service import DeviceRequest
-from thermostand.stand.serving.desk import Who
+from thermostand.stand.serving.api_models import Who
 
 
 async def test_midnight_changes_the_record_beneath_heat_by_hand(
@@ -20,7 +20,7 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
 ):
     out, who = tmp_path / "out", Who(name="a test", how="terminal")
     day = ["20261122"]
-    monkeypatch.setattr(DayRecord, "_today", lambda _: day[0])
+    monkeypatch.setattr(IdleLog, "_get_today", lambda _: day[0])
     reported: list[Event] = []
     told: list[bytes] = []  # to the service manager
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)

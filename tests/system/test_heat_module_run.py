@@ -10,14 +10,14 @@ import yaml
 
 from tests.system.virtual_stand import REAL_TIME, VirtualStand, heating_process, virtual_stand
 from thermostand.foundation.errors import DeviceFault
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.config.stand_config import find_packaged, load_config
 
 MODULE = {"registers": "icpdas-m7024", "unit": 4, "channel": 2, "watchdog_s": 12.0}
 CHANNELS = {"heater_enable": 0, "compressor": 1, "camera_power": 2}
 
 
 def stand_file(folder: Path, **sections: dict[str, Any]) -> Path:
-    data = yaml.safe_load(packaged("", "software-regulator").read_text())
+    data = yaml.safe_load(find_packaged("", "software-regulator").read_text())
     data |= {"axes": {}, "cameras": {}, "heat_module": dict(MODULE)}
     data["relays"]["channels"] = dict(CHANNELS)
     for name, entries in sections.items():

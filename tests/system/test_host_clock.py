@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.system.conftest import FAST
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import CLOCK_STEP
 from thermostand.foundation.hub import Hub
@@ -28,7 +28,7 @@ from thermostand.stand.commands.sessions.session_commands import app
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_real
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of
+from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 MOVED = Path(__file__).parent / "moved_clocks"
 COLD = """
@@ -68,7 +68,7 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
     def watch(hub: Hub) -> None:
         def move(item: Item) -> None:
             if isinstance(item, StepMark) and item.kind == "soak" and not host.step_ns:
-                host.suspended_ns, host.step_ns = seconds_ns(40), seconds_ns(-3600)
+                host.suspended_ns, host.step_ns = to_ns(40), to_ns(-3600)
 
         hub.subscribe(move)
 
@@ -80,10 +80,10 @@ async def test_a_suspend_and_a_step_of_the_system_clock_are_recorded_and_instant
     assert events["host_suspended"].data["length_s"] == pytest.approx(40, abs=0.1)
     step = events[CLOCK_STEP]
     assert step.data["offset_before_ns"] == 0
-    assert step.data["offset_after_ns"] == pytest.approx(seconds_ns(-3600), abs=seconds_ns(0.5))
+    assert step.data["offset_after_ns"] == pytest.approx(to_ns(-3600), abs=to_ns(0.5))
     times_ns = session.readings("regulator.pv")[0]
     assert np.all(np.diff(times_ns) > 0)
-    assert times_ns[-1] - times_ns[0] > seconds_ns(40)
+    assert times_ns[-1] - times_ns[0] > to_ns(40)
     reported = json.loads(CliRunner().invoke(app, ["info", str(directory), "--json"]).stdout)
     assert reported["duration_s"] > 40
     assert reported["end"] < reported["start"]  # as the system clock had it
@@ -104,12 +104,12 @@ class Host:
         with monkeypatch.context() as changed:
             for name, value in self._environment.items():
                 changed.setenv(name, value)
-            self.laboratory = Simulator(laboratory_of(order.config, virtual=False, seed=None))
+            self.laboratory = Simulator(describe_laboratory(order.config, virtual=False, seed=None))
 
     def moves(self, suspended_s: float, step_s: float) -> None:
         """In all since the begin."""
         with self._file.open("r+b" if self._file.exists() else "wb") as file:
-            file.write(struct.pack("qq", seconds_ns(suspended_s), seconds_ns(step_s)))
+            file.write(struct.pack("qq", to_ns(suspended_s), to_ns(step_s)))
 
     @contextlib.contextmanager
     def daemon(self, *command: str) -> Iterator[subprocess.Popen[str]]:
@@ -173,7 +173,7 @@ async def test_the_compressor_rests_whatever_the_system_clock_does_between_two_d
     assert np.all(np.diff(times_ns) > 0)
     steps = [event.data["offset_after_ns"] for event in session.events() if event.kind == CLOCK_STEP]
     if step_s < 0:
-        assert steps[0] == pytest.approx(seconds_ns(step_s), abs=seconds_ns(60))
+        assert steps[0] == pytest.approx(to_ns(step_s), abs=to_ns(60))
         assert all(one == steps[0] for one, _ in itertools.pairwise(steps))
     else:
         assert steps == []  # the session goes on at the hour that the system clock has now

@@ -36,9 +36,9 @@ def help_of(app, name):
 
 def load(recipe):
     import thermostand.stand.service.run
-    from thermostand.stand.running.executing.settling_watch import load_for
+    from thermostand.stand.running.executing.settling_watch import preload_for
     from thermostand.stand.running.order import load_order
-    load_for(load_order(recipe, "simulated").recipe.plan())
+    preload_for(load_order(recipe, "simulated").recipe.plan())
 """
 
 

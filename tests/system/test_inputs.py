@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import ConfigError, StandError, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.guarding.rules import Announcements, watches
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.guarding.rules import Announcements, make_watches
 from thermostand.stand.running.order import load_order
 from thermostand.stand.service.run import run_virtual
 
@@ -28,7 +28,7 @@ steps:
 
 def stand(folder: Path, action: str, unit: int, *faults: str, **changes: object) -> Path:
     """A simulated stand without a camera, with a door on input 2 and a key switch on input 0."""
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["cameras"], data["axes"] = {}, {}
     door = {"channel": 2, "action": action, "means": "the chamber's door", **changes}
     key = {"channel": 0, "fault_when": "closed", "action": "warn"}
@@ -89,17 +89,17 @@ async def test_a_door_that_is_opened_for_less_than_it_may_is_nothing(tmp_path: P
 @pytest.mark.parametrize(("action", "done"), [("hold", "hold"), ("trip", "abort"), ("warn", "warn")])
 def test_a_contact_that_is_lost_holds_and_ends_no_run(tmp_path: Path, action: str, done: str):
     config, hub = load_config(stand(tmp_path, action, 2)), Hub()
-    rules = watches(config, Announcements())
+    rules = make_watches(config, Announcements())
 
     def faults(at_s: int, reading: Reading) -> list[tuple[str, str]]:
         hub.publish(Batch("inputs", reading.time_ns, (reading,)))
-        found = [fault for watch in rules if (fault := watch.check(hub, seconds_ns(at_s))) is not None]
+        found = [fault for watch in rules if (fault := watch.check(hub, to_ns(at_s))) is not None]
         return [(fault.rule, fault.action) for fault in found if "inputs.door" in fault.text]
 
-    assert faults(1, Reading("inputs.door", 1.0, "1", seconds_ns(1))) == []
-    assert faults(2, Reading("inputs.door", 0.0, "1", seconds_ns(2))) == [("contact", done)]
-    assert faults(3, Reading("inputs.door", 1.0, "1", seconds_ns(3))) == []
-    lost = bad_reading("inputs.door", "1", seconds_ns(30), "no reply", "wire")
+    assert faults(1, Reading("inputs.door", 1.0, "1", to_ns(1))) == []
+    assert faults(2, Reading("inputs.door", 0.0, "1", to_ns(2))) == [("contact", done)]
+    assert faults(3, Reading("inputs.door", 1.0, "1", to_ns(3))) == []
+    lost = bad_reading("inputs.door", "1", to_ns(30), "no reply", "wire")
     assert faults(30, lost) == [("sensor_bad", "warn" if action == "warn" else "hold")]
 
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.asking import ask
+from tests.daemon_queries import ask
 from tests.recording.disks import limit_files
 from tests.system.test_run import fault
 from thermostand.experiments.steps import Capture
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Frame
-from thermostand.recording.format.restarts import begins_of, is_superseded
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
@@ -42,7 +42,7 @@ class Interrupter:
 
     def __init__(self, begin: Action, end: Action, length_s: float) -> None:
         self.events: list[Event] = []
-        self._begin, self._end, self._length_ns = begin, end, seconds_ns(length_s)
+        self._begin, self._end, self._length_ns = begin, end, to_ns(length_s)
         self._frames, self._end_ns = 0, 0
         self._tasks: list[asyncio.Future[object]] = []
 
@@ -98,7 +98,7 @@ async def interrupted(order: Order, out: Path, interrupter: Interrupter) -> Sess
 
 def counted_ns(session: Session) -> list[int]:
     """Instants of the frames that count."""
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     return [m.time_ns for m in session.frame_metas() if not is_superseded(m.time_ns, m.step_id, begins_ns)]
 
 

@@ -10,7 +10,7 @@ from tests.journals import read_lines
 from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import check, check_soaks, revived
-from thermostand.stand.running.memory.entries import Ended, Gap, Written
+from thermostand.stand.running.memory.entries import Ended, Gap, JournalEntry
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 
@@ -59,6 +59,6 @@ def is_over(daemon: Daemon, real_s: float, out: Path) -> bool:
     return bool(last) and isinstance(last[0], Ended) and last[0].status == "complete"
 
 
-def entries(out: Path) -> list[Written]:
+def entries(out: Path) -> list[JournalEntry]:
     """The journal of the only session; nothing when none has begun."""
     return [entry for path in out.glob(f"*/{JOURNAL_NAME}") for entry in read_lines(path.read_bytes())[0]]

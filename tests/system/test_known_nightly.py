@@ -8,11 +8,11 @@ import pytest
 
 from tests.journals import read_lines
 from tests.system.conftest import WHOLE_SENSOR
-from thermostand.experiments.known import Visit
+from thermostand.experiments.adaptive import Visit
 from thermostand.experiments.steps import Capture, Decide
 from thermostand.foundation.clock import WallClock
 from thermostand.recording.reading.session import Session
-from thermostand.stand.running.executing.deciding import Decider
+from thermostand.stand.running.executing.decisions import Decider
 from thermostand.stand.running.memory.entries import Edited
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.session_report import DECIDES

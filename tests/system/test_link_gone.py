@@ -23,13 +23,13 @@ from thermostand.foundation.errors import StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.daemon import Daemon
 from thermostand.stand.service.run import Interrupted, run_virtual
 from thermostand.stand.service.serve import serve
 from thermostand.stand.service.stand_service import StandService, SubmitRequest
-from thermostand.stand.serving.desk import Who
+from thermostand.stand.serving.api_models import Who
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 QUICK = {"timeout_s": 0.1}
@@ -134,7 +134,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     monkeypatch.setattr("thermostand.stand.safety._GIVEN_UP_AFTER_S", 0.1)
     monkeypatch.setattr("thermostand.stand.service.daemon._LOOK_S", 0.2)
     text = (tmp_path / "config.yaml").read_text()
-    texts = {"config.yaml": text, "target.yaml": packaged("targets", ordered.config.target).read_text()}
+    texts = {"config.yaml": text, "target.yaml": find_packaged("targets", ordered.config.target).read_text()}
     watcher = Watcher()
 
     async def broken(daemon: Daemon, desk: StandService) -> None:
@@ -143,7 +143,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
         await fault(ordered, "bus.unplugged", True)
         daemon.leave()
         await asyncio.sleep(0.8)  # what waits for the run has looked four times
-        tries = daemon.has_guest
+        tries = daemon.has_admitted_run
         await fault(ordered, "bus.unplugged", False)
         assert tries
 

@@ -11,7 +11,7 @@ import pytest
 from thermostand.compensation.drift.evaluation import Evaluation
 from thermostand.compensation.reporting.report import analyse
 from thermostand.foundation.progress import progress
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
@@ -40,7 +40,7 @@ def digests(session: Path) -> dict[str, str]:
 
 
 async def test_the_demo_is_the_same_twice_and_compensation_gains(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(packaged("recipes", "demo").read_text())
+    ordered = order(find_packaged("recipes", "demo").read_text())
     first = await night(ordered, tmp_path / "first")
     second = await night(ordered, tmp_path / "second")
     assert len(digests(first)) >= 2
@@ -53,7 +53,7 @@ async def test_the_demo_is_the_same_twice_and_compensation_gains(tmp_path: Path,
 
 
 async def test_the_unmodified_camera_drifts_more_and_is_compensated_too(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(packaged("recipes", "demo").read_text(), simulation={"camera": "unmodified"})
+    ordered = order(find_packaged("recipes", "demo").read_text(), simulation={"camera": "unmodified"})
     evaluation = score(await night(ordered, tmp_path / "out"))
     for axis in (0, 1):
         assert evaluation.rms_before_px[axis] > BEFORE_PX[axis]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask, ask_status
+from tests.daemon_queries import ask, ask_status
 from tests.journals import read_lines
 from tests.system.test_attended import PROMPTED
 from tests.system.test_guard_run import check_safe

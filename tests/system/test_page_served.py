@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
-from tests import forked
+from tests import fork_server
 from tests.stand.browser import a_page, browser, needs_chromium
-from tests.stand.page_desk import free_port
+from tests.stand.page_service import free_port
 from tests.system.test_daemon import Served
 
 pytestmark = needs_chromium
@@ -34,7 +34,7 @@ class ServedPage(Served):
         self.out = out
         arguments = ["serve", str(config_file), "--out", str(out), "--port", str(port)]
         command = [sys.executable, "-m", "thermostand.stand.cli", *arguments]
-        self.process = forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.process = fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 @pytest.fixture

@@ -6,24 +6,24 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-from tests.asking import ask
+from tests.daemon_queries import ask
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import Assembly
-from thermostand.stand.running.course import Course
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order
+from thermostand.stand.running.run_control import RunControl
 from thermostand.stand.service.stand_service import PauseRequest, StandService
-from thermostand.stand.serving.desk import Done, Who
+from thermostand.stand.serving.api_models import Done, Who
 
 
 def service_of(assembly: Assembly) -> StandService:
     """Of a run of which only the stand is asked."""
     log, nothing = Logbook(assembly.hub, assembly.clock, fold((), ())), cast("Any", None)
-    course = Course(assembly, Path("session"), Stop(), log, nothing, nothing, nothing)
+    course = RunControl(assembly, Path("session"), Stop(), log, nothing, nothing, nothing)
     guest, open_stand = SimpleNamespace(course=course), SimpleNamespace(assembly=assembly)
     return StandService(cast("Any", SimpleNamespace(open_stand=open_stand, guest=guest)))
 

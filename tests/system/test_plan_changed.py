@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask
+from tests.daemon_queries import ask
 from tests.system.conftest import SHORT_RECIPE
 from thermostand.experiments.steps import Capture, CloseFlap, OpenFlap, Role, SetTemperature, Soak, StopChamber
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
-from thermostand.recording.reading.overview import overview
-from thermostand.recording.reading.run_word import Files, RunOutcome
+from thermostand.recording.reading.overview import summarise_session
+from thermostand.recording.reading.run_status import Files, RunOutcome
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.executing.executor import Executor
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
@@ -35,7 +35,7 @@ def executors(monkeypatch: pytest.MonkeyPatch) -> list[Executor]:
             super().__init__(*args, **options)
             found.append(self)
 
-    monkeypatch.setattr("thermostand.stand.running.guest.Executor", Kept)
+    monkeypatch.setattr("thermostand.stand.running.run.Executor", Kept)
     return found
 
 
@@ -72,7 +72,7 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
     await asyncio.gather(*tasks)
     (directory,) = out.iterdir()
     state = executors[0]._log.state
-    before = interruption(directory)
+    before = load_interruption(directory)
     assert (before.state.plan, before.state.changes) == (state.plan, state.changes)
     await resume(before, lambda hub: None)
 
@@ -93,5 +93,5 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
     soaked = next(mark for mark in session.steps() if mark.step_id == soak.step_id and mark.state is StepState.DONE)
     assert soaked.parameters["duration_s"] == 360.0
     assert session.frame_count == 2
-    assert overview(directory).planned_steps == len(ends)
+    assert summarise_session(directory).planned_steps == len(ends)
     assert second.step_id not in {mark.step_id for mark in session.steps()}

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.nightly import by_night
+from tests.nightly import mark_nightly
 from tests.stand.guarded_recipes import RECIPES
 from tests.system.conftest import AS_INSTALLED, CORNER, WHOLE_SENSOR
 from tests.system.test_guard_wire import Bench, bench_of
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 from thermostand.stand.simulator import Simulator
@@ -68,7 +68,7 @@ async def _check(bench: Bench, failure: str) -> None:
     assert bench.trips or failure in HARMLESS
 
 
-@pytest.mark.parametrize("failure", ["both stuck low", by_night("both out of the chamber")])
+@pytest.mark.parametrize("failure", ["both stuck low", mark_nightly("both out of the chamber")])
 async def test_the_heat_is_cut_before_the_air_is_too_warm(order: Callable[..., Order], simulator: Start, failure: str):
     async with bench_of(order(simulation={"chamber_seed": 9}), simulator) as bench:
         await _check(bench, failure)
@@ -100,7 +100,7 @@ async def test_a_whole_recipe_on_a_drawn_chamber_is_not_disturbed(
     tmp_path: Path, order: Callable[..., Order], recipe: str
 ):
     chamber_seed = RECIPES.index(recipe)
-    text = packaged("recipes", recipe).read_text()
+    text = find_packaged("recipes", recipe).read_text()
     camera = WHOLE_SENSOR if recipe in LOOKED_AT else CORNER
     ordered = order(text, camera=camera, simulation={"chamber_seed": chamber_seed})
     session_folder = await run_virtual(ordered, tmp_path / "out", None, lambda hub: None)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.conftest import require_aravis
-from tests.system.protocol_night import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
+from tests.system.protocol_run import GROWTH_LIMIT_MB, PROTOCOL, POLL_s, outcomes
 from tests.system.simulated_orders import simulated_order
 
 

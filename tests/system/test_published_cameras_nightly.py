@@ -14,7 +14,7 @@ from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import Role
 from thermostand.foundation.documents import parse_document
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
 
@@ -30,13 +30,13 @@ EFFECTS = ["sag", "dead_zone", "creep", "stick_slip", "unrepeated", "coarse_sens
 
 
 def recorded(optics: str, out: Path) -> Observations:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["simulation"]["cameras"] = {"camera": {"optics": optics, "effects": EFFECTS, "drawn": 3}}
     data["guard"]["camera_crosscheck"] = {"settle_s": 14400, "limit_K": 12}  # of a camera that nobody has measured
     data["chamber"] = {"camera_lag_s": 2000}
     text = yaml.safe_dump(data)
     config, recipe = parse_document(text, StandConfig, "config"), parse_document(RECIPE, Recipe, "recipe")
-    order = Order(config, recipe, text, RECIPE, packaged("targets", "paper-9x6").read_text())
+    order = Order(config, recipe, text, RECIPE, find_packaged("targets", "paper-9x6").read_text())
     return observe(asyncio.run(run_virtual(order, out, 1, lambda _: None)))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.compensation.rendered import Scene, photograph, render
+from tests.compensation.renderer import Scene, photograph, render
 from tests.system.conftest import require_aravis
 from tests.system.test_docs import DOCS, PROGRAMS, blocks_of, called
 from tests.system.test_validation_nightly import VALIDATION

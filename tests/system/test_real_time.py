@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from tests.addresses import camera_address, free_port
+from tests.addresses import allocate_camera_address, find_free_port
 from tests.stand.secop_talk import talking
 from tests.system.conftest import CORNER, FAST
 from thermostand.foundation.errors import SessionError, Unreachable
@@ -20,12 +20,12 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.live import RunFollower
-from thermostand.stand.commands.moment import ShownMoment
+from thermostand.stand.commands.status_snapshot import StatusSnapshot
 from thermostand.stand.config.interface_section import InterfaceConfig
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import Interrupted, run_real
-from thermostand.stand.serving.client import API, server_at
-from thermostand.stand.serving.front import interface_of
+from thermostand.stand.serving.client import API, make_server
+from thermostand.stand.serving.interface import make_interface
 from thermostand.stand.simulator import ControlSocket
 
 BRIEF = """
@@ -58,7 +58,13 @@ async def test_a_brief_run_in_real_time_over_serial_wires(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
     """With a camera that is triggered and one that runs free."""
-    side = {**FAST["camera"], **CORNER, "address": camera_address(), "serial_number": "TS-0002", "trigger": "free_run"}
+    side = {
+        **FAST["camera"],
+        **CORNER,
+        "address": allocate_camera_address(),
+        "serial_number": "TS-0002",
+        "trigger": "free_run",
+    }
     ordered = order(FRAMES, wire="serial", **FAST, cameras={"side": side})
     await asyncio.to_thread(simulator, ordered.config, False)
     session = Session.open(await run_real(ordered, tmp_path / "out", ignore))
@@ -99,13 +105,13 @@ async def test_a_run_by_itself_has_the_page_and_secop_of_its_file_and_either_sto
 ):
     ordered = order(BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600"), **FAST)
     await asyncio.to_thread(simulator, ordered.config, False)
-    ports = InterfaceConfig(port=free_port(), secop_port=free_port())
+    ports = InterfaceConfig(port=find_free_port(), secop_port=find_free_port())
     config = ordered.config.model_copy(update={"interface": ports})
-    lines, moments, out = list[str](), list[ShownMoment](), tmp_path / "out"
+    lines, moments, out = list[str](), list[StatusSnapshot](), tmp_path / "out"
     shown = RunFollower(moments.append, lines.append, out)
-    front = shown.front_at(interface_of(config, out), ordered.target_text)
+    front = shown.make_front(make_interface(config, out), ordered.target_text)
     run = asyncio.create_task(run_real(ordered, out, shown.watch, front=front))
-    there = server_at(f"http://127.0.0.1:{ports.port}")
+    there = make_server(f"http://127.0.0.1:{ports.port}")
     async with asyncio.timeout(60.0):
         while not moments:
             await asyncio.sleep(0.1)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.system.conftest import WHOLE_SENSOR
-from thermostand.compensation.observations import observe_session, session_target
+from thermostand.compensation.observations import observe_session, read_session_target
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
@@ -38,7 +38,7 @@ async def test_roi_keeps_the_markers_and_a_whole_frame_of_each_capture(tmp_path:
     session = Session.open(directory)
     windows = [frame.windows for frame in session.frames()]
     assert [0 if window is None else len(window) for window in windows] == [0, 54, 54, 0, 54]
-    observed = observe_session(session, session_target(session))
+    observed = observe_session(session, read_session_target(session))
     assert observed.usable.all()
     assert not np.isnan(observed.centres_px).any()
     sizes = [image.stored_bytes for image in session.images()]

@@ -6,18 +6,18 @@ import pytest
 import yaml
 
 from thermostand.foundation.errors import ConfigError
-from thermostand.recording.reading.run_word import RunOutcome
+from thermostand.recording.reading.run_status import RunOutcome
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import StandConfig, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import load_order
-from thermostand.stand.service.run import rehearsed, run_virtual
+from thermostand.stand.service.run import make_rehearsal, run_virtual
 
 RECIPE = "name: short\nsteps:\n  - start_chamber: 26\n  - soak: 300\n  - stop_chamber\n"
 
 
 def real_stand(folder: Path, **changes: object) -> Path:
     """The installed laboratory's file with a few things that only this one has, and no camera."""
-    data = yaml.safe_load(packaged("", "laboratory").read_text())
+    data = yaml.safe_load(find_packaged("", "laboratory").read_text())
     data["limits"]["chamber_degC"] = [12, 48]
     data["alerts"] = {"command": ["/bin/true"]}
     data |= {"cameras": {}, **changes}
@@ -38,10 +38,10 @@ async def test_the_rehearsal_of_a_real_stand_runs_and_is_recorded_as_simulated(t
 
 
 def test_what_is_kept_and_what_is_replaced(tmp_path: Path):
-    laboratory = yaml.safe_load(packaged("", "laboratory").read_text())
+    laboratory = yaml.safe_load(find_packaged("", "laboratory").read_text())
     path = real_stand(tmp_path, cameras=laboratory["cameras"])
     order = load_order(str(tmp_path / "short.yaml"), str(path))
-    found = rehearsed(order)
+    found = make_rehearsal(order)
     own, there = order.config, found.config
     assert there.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"}) == (
         own.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"})
@@ -54,12 +54,12 @@ def test_what_is_kept_and_what_is_replaced(tmp_path: Path):
     assert (there.camera.exposure_s, there.camera.serial_number) == (own.camera.exposure_s, own.camera.serial_number)
     assert there.bus.address.startswith("tcp:127.0.0.1")
     assert (there.alerts.command, there.compressor.state_file) == ((), None)
-    assert rehearsed(found) == found
+    assert make_rehearsal(found) == found
 
 
 def test_an_axis_that_the_laboratory_does_not_have_is_reported(tmp_path: Path):
-    data = yaml.safe_load(packaged("", "laboratory").read_text())
+    data = yaml.safe_load(find_packaged("", "laboratory").read_text())
     axes = {"linear": data["axes"]["linear"], "tilt": data["axes"]["rotary"]}
     path = real_stand(tmp_path, axes=axes)
     with pytest.raises(ConfigError, match="tilt, only linear, rotary"):
-        rehearsed(load_order(str(tmp_path / "short.yaml"), str(path)))
+        make_rehearsal(load_order(str(tmp_path / "short.yaml"), str(path)))

@@ -8,11 +8,11 @@ import pytest
 
 from tests.system.conftest import AS_INSTALLED
 from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_another_master
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import DeviceFault, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.stand.assembly import Assembly, assemble
-from thermostand.stand.imaging.camera_opening import CameraOpening
+from thermostand.stand.imaging.camera_recovery import CameraRecovery
 from thermostand.stand.running.order import Order
 
 POLLED = AS_INSTALLED
@@ -41,7 +41,7 @@ async def seconds_until(bench: Bench, quantity: str, value: float, limit_s: floa
     """How long the plant's quantity takes to read that, in steps of 0.5 s."""
     begin_ns = bench.clock.now_ns()
     while await bench.plant(quantity) != value:
-        assert bench.clock.now_ns() - begin_ns < seconds_ns(limit_s), f"{quantity} is not {value} within {limit_s} s"
+        assert bench.clock.now_ns() - begin_ns < to_ns(limit_s), f"{quantity} is not {value} within {limit_s} s"
         await bench.wait(0.5)
     return (bench.clock.now_ns() - begin_ns) / 1e9
 
@@ -98,7 +98,7 @@ async def test_heat_that_the_timer_of_a_silent_board_ends_is_known_as_ended_unti
         await bench.wait(1)
         assert bench.trips == []
         assert permits.ended_ns is not None
-        assert begin_ns + seconds_ns(60) < permits.ended_ns < bench.clock.now_ns()
+        assert begin_ns + to_ns(60) < permits.ended_ns < bench.clock.now_ns()
         await bench.fault("relays.silent", False)
         await seconds_until(bench, "heater_enabled", 1, 20)
         assert permits.ended_ns is None
@@ -146,7 +146,7 @@ async def test_another_master_that_switches_heat_on_twice_without_permission_hol
 
 
 async def test_a_board_that_is_suited_passes_the_test_of_its_timer(bench: Bench):
-    await bench.assembly.stand.chamber.permits.withdraw_left_on()
+    await bench.assembly.stand.chamber.permits.switch_off_left_on()
     await bench.assembly.stand.chamber.test_dead_man()
     (reported,) = [event for event in bench.events if event.kind == "dead_man_tested"]
     assert (reported.level, reported.data["rearmed"], reported.data["dropped"]) == ("info", True, True)
@@ -159,7 +159,7 @@ async def test_a_board_that_is_suited_passes_the_test_of_its_timer(bench: Bench)
 )
 async def test_a_board_that_is_not_suited_is_refused_with_the_reason(bench: Bench, name: str, reason: str):
     await bench.fault(name, True)
-    await bench.assembly.stand.chamber.permits.withdraw_left_on()
+    await bench.assembly.stand.chamber.permits.switch_off_left_on()
     with pytest.raises(DeviceFault, match=reason):
         await bench.assembly.stand.chamber.test_dead_man()
     assert await bench.plant("heater_enabled") == 0
@@ -183,7 +183,7 @@ def with_exchanged_relays(bench: Bench) -> Assembly:
     config = bench.order.config.model_copy(update={"relays": relays.model_copy(update={"channels": exchanged})})
     theirs = assemble(config, Hub(), bench.clock)
     camera: Any = SilentCamera()
-    theirs.stand.imaging.supply.opening = CameraOpening(
+    theirs.stand.imaging.supply.recovery = CameraRecovery(
         camera, theirs.hub, bench.clock, lambda: False, lambda why: None
     )
     return theirs

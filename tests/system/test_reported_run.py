@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from tests import forked
+from tests import fork_server
 from tests.system.conftest import WHOLE_SENSOR
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.foundation.exit_codes import NOT_REPORTED
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.config.stand_config import packaged
-from thermostand.stand.estimating.estimate import price
+from thermostand.stand.config.stand_config import find_packaged
+from thermostand.stand.estimating.estimate import price_plan
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.session_report import MODEL_NAME, REPORT_NAME
 
@@ -98,7 +98,7 @@ def run_reported(recipe: str, config_text: str, out: Path, timeout_s: float) -> 
     command = [sys.executable, "-m", "thermostand.stand.cli", "run", recipe, "--config", str(config), "--out", str(out)]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     options = ["--virtual-time", "--report"]
-    return forked.run([*command, *options], capture_output=True, text=True, env=environment, timeout=timeout_s)
+    return fork_server.run([*command, *options], capture_output=True, text=True, env=environment, timeout=timeout_s)
 
 
 def run_here(recipe: str, config_text: str, out: Path) -> Result:
@@ -183,7 +183,7 @@ def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_
     assert not [event.text for event in session.events() if event.level != "info"]
 
     order = load_order("overnight", str(out.parent / "stand.yaml"))
-    expected_s = {step.planned.step_id: step.duration_s for step in price(order.recipe.plan(), order.config)}
+    expected_s = {step.planned.step_id: step.duration_s for step in price_plan(order.recipe.plan(), order.config)}
     marks = [mark for mark in session.steps() if mark.kind != "cool_down"]  # the simulated camera is cold already
     took_s = sum((end.time_ns - begin.time_ns) / 1e9 for begin, end in zip(marks[::2], marks[1::2], strict=True))
     assert took_s == pytest.approx(sum(expected_s[mark.step_id] for mark in marks[::2]), rel=0.02)
@@ -199,4 +199,4 @@ def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_
         "Measured with",
     ):
         assert f">{title}<" in report
-    assert packaged("recipes", "overnight").read_text() == session.attachments["recipe.yaml"]
+    assert find_packaged("recipes", "overnight").read_text() == session.attachments["recipe.yaml"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask, ask_status
+from tests.daemon_queries import ask, ask_status
 from tests.journals import lines_with, read_lines
 from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
@@ -20,15 +20,15 @@ from thermostand.experiments.steps import Capture
 from thermostand.foundation.errors import SessionError, StandTripped, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepState
+from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.format.messages import FRAME_META_CLASS
-from thermostand.recording.format.restarts import begins_of, is_superseded
-from thermostand.recording.reading.run_word import Files, RunOutcome
+from thermostand.recording.reading.run_status import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.running.memory.entries import Gap, Soaked, StepChanged
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import Interruption, interruption
+from thermostand.stand.running.resume import Interruption, load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 from thermostand.stand.simulator import ControlSocket
 
@@ -99,7 +99,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     assert done == Counter(planned.step_id for planned in plan)
     times_ns = set(session.frame_times_ns.tolist())
     assert set(acknowledged) <= times_ns
-    begins_ns = begins_of(session.events())
+    begins_ns = find_restart_times(session.events())
     described = Counter(
         meta.step_id for meta in session.frame_metas() if not is_superseded(meta.time_ns, meta.step_id, begins_ns)
     )
@@ -107,7 +107,7 @@ def check(directory: Path, order: Order, acknowledged: list[int]) -> Session:
     found = verify(directory, lambda done, text: None)
     assert found.is_sound, found.findings
     with pytest.raises(SessionError, match="is complete"):
-        interruption(directory)
+        load_interruption(directory)
     return session
 
 
@@ -165,7 +165,7 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
         status = await asyncio.to_thread(ask_status, directory)
         assert (status.state, status.reasons, status.recipe, status.frames_lost) == ("held", ("operator",), "short", 0)
         with pytest.raises(SessionError, match="is running this session"):
-            interruption(directory)
+            load_interruption(directory)
         assert (await asyncio.to_thread(ask, directory, "continue"))["reasons"] == []
         await asyncio.to_thread(ask, directory, "stop")
 
@@ -179,10 +179,10 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
     assert kinds.index("held") < kinds.index("released") < kinds.index("run.end")
 
     with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
-        await resume(findable(interruption(directory)), start(lambda: fault(ordered, "thermometer.open", "air")))
+        await resume(findable(load_interruption(directory)), start(lambda: fault(ordered, "thermometer.open", "air")))
     with pytest.raises(SessionError, match=r"tripped: thermometers\.air is BAD.*resume with --reset"):
-        interruption(directory)
-    assert await resume(interruption(directory, reset=True), lambda hub: None) == directory
+        load_interruption(directory)
+    assert await resume(load_interruption(directory, reset=True), lambda hub: None) == directory
     await asyncio.gather(*tasks)
     session = check(directory, ordered, [])
     check_soaks(directory, ordered)
@@ -200,16 +200,16 @@ def test_a_session_whose_files_or_journal_are_not_its_own_is_not_resumed(tmp_pat
     begun = read_lines(journal.read_bytes())[0][0]
     journal.write_bytes(lines_with([replace(begun, texts={**begun.texts, "recipe.yaml": "0"})]))
     with pytest.raises(SessionError, match="attached files"):
-        interruption(directory)
+        load_interruption(directory)
     journal.write_bytes(lines_with([replace(begun, plan="0")]))
     with pytest.raises(SessionError, match="makes another plan"):
-        interruption(directory)
+        load_interruption(directory)
     journal.write_bytes(b"")
     with pytest.raises(SessionError, match="had not begun"):
-        interruption(directory)
+        load_interruption(directory)
     journal.unlink()
     with pytest.raises(SessionError, match="no journal"):
-        interruption(directory)
+        load_interruption(directory)
     asyncio.run(end_laboratory(ordered))
 
 

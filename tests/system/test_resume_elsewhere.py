@@ -22,12 +22,12 @@ from thermostand.foundation.errors import ConfigError, SessionError, StandTrippe
 from thermostand.foundation.sealed import seal
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.running.opening.own_stand import on_this_stand
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.running.opening.resume_config import make_resume_config
 from thermostand.stand.running.order import Order, load_order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service import queue
-from thermostand.stand.service.queue_file import QUEUE_NAME, worked_on
+from thermostand.stand.service.queue_file import QUEUE_NAME, start_working
 from thermostand.stand.service.run import Interrupted, resume, run_real, run_virtual
 
 CAPTURES = """
@@ -40,7 +40,7 @@ LIMIT_S = 90.0
 
 def config_of(tmp_path: Path, name: str = "laboratory", **sections: dict[str, object]) -> StandConfig:
     """An installed configuration with some entries of its sections replaced."""
-    data = yaml.safe_load(packaged("", name).read_text())
+    data = yaml.safe_load(find_packaged("", name).read_text())
     change(data, sections)
     file = tmp_path / "changed.yaml"
     file.write_text(yaml.safe_dump(data))
@@ -69,7 +69,7 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
     def broken() -> None:
         tasks.append(asyncio.get_running_loop().create_task(fault(hostile, "thermometer.open", "air")))
 
-    before = findable(interruption(directory))
+    before = findable(load_interruption(directory))
     assert "touch" in before.order.config_text  # what is recorded stays as it was
     with pytest.raises(StandTripped, match=r"thermometers\.air is BAD"):
         asyncio.run(resume(before, at_step("soak", broken)))
@@ -97,7 +97,7 @@ async def test_a_session_of_a_stand_at_other_addresses_is_resumed_at_those_of_th
             await run_real(ordered, tmp_path / "out", stopped())
     (directory,) = (tmp_path / "out").glob("*-brief")
     own = config_of(tmp_path, "simulated", guard={"max_air_degC": 64.0})
-    before = interruption(directory, own)
+    before = load_interruption(directory, own)
     before.release()
     config = before.order.config
     assert config.bus == own.bus
@@ -113,7 +113,7 @@ async def test_a_session_of_a_stand_at_other_addresses_is_resumed_at_those_of_th
         "simulation.control",
     } <= set(paths)
     with pytest.raises(ConfigError, match="'laboratory-stand' is a real"):
-        interruption(directory, config_of(tmp_path))
+        load_interruption(directory, config_of(tmp_path))
 
 
 def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp_path: Path):
@@ -131,7 +131,7 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
         limits={"chamber_degC": [-10, 59]},
         compressor={"state_file": "/etc/passwd", "min_off_s": 181},
     )
-    config, differences = on_this_stand(session, own, tmp_path, is_virtual=False)
+    config, differences = make_resume_config(session, own, tmp_path, is_virtual=False)
     temperature = TemperatureFeature(entry="Mainboard")
     kept = {
         "cameras": {"camera": own.cameras["camera"].model_copy(update={"exposure_s": 0.2, "temperature": temperature})},
@@ -148,7 +148,7 @@ def test_a_thermometer_that_was_renamed_is_reported_as_one_that_came_and_one_tha
     session = config_of(tmp_path)
     named = {"lens" if name == "artifact" else name: each for name, each in session.thermometers.items()}
     own = session.model_copy(update={"thermometers": named})
-    config, differences = on_this_stand(session, own, tmp_path, is_virtual=False)
+    config, differences = make_resume_config(session, own, tmp_path, is_virtual=False)
     assert list(config.sensors) == list(own.sensors)
     went, came = map(str, differences)
     assert went.startswith("thermometers.artifact is not given")
@@ -158,7 +158,7 @@ def test_a_thermometer_that_was_renamed_is_reported_as_one_that_came_and_one_tha
 
 def test_the_same_configuration_does_not_differ(tmp_path: Path):
     own = config_of(tmp_path)
-    assert on_this_stand(own, own, tmp_path, is_virtual=False) == (own, ())
+    assert make_resume_config(own, own, tmp_path, is_virtual=False) == (own, ())
 
 
 def test_a_simulated_session_never_reaches_a_real_flap_or_file(tmp_path: Path):
@@ -166,7 +166,7 @@ def test_a_simulated_session_never_reaches_a_real_flap_or_file(tmp_path: Path):
     session = config_of(
         tmp_path, "simulated", flap={"backend": "somebodys.module"}, relays={"registers": "/tmp/somebody.yaml"}
     )
-    config, differences = on_this_stand(session, config_of(tmp_path), tmp_path, is_virtual=True)
+    config, differences = make_resume_config(session, config_of(tmp_path), tmp_path, is_virtual=True)
     assert config.flap.backend == "thermostand.drivers.sim.usb"
     assert config.relays.registers == "waveshare-relay"
     assert {difference.path for difference in differences} == {"relays.registers", "flap.backend"}
@@ -177,13 +177,13 @@ def test_a_simulated_session_never_reaches_a_real_flap_or_file(tmp_path: Path):
     ["../elsewhere", "..", ".", "/etc", "a/b", "a\\b", "a\x1b[2J", "a\nb", "a\0b", "x" * 256, 7, None, ["a"]],
 )
 def test_a_queue_that_names_another_folder_is_refused_and_nothing_is_run(tmp_path: Path, session: object):
-    queue.append(tmp_path, queue.entry_of(load_order("warm-up", "simulated"), "simulated", 1))
+    queue.append(tmp_path, queue.make_entry(load_order("warm-up", "simulated"), "simulated", 1))
     file = tmp_path / QUEUE_NAME
     document = json.loads(file.read_text())
     document["entries"][0] |= {"session": session, "state": "interrupted"}
     file.write_bytes(seal("queue", json.dumps(document)))
     before = sorted(tmp_path.rglob("*"))
-    for take in (queue.queued, worked_on):
+    for take in (queue.load_queue, start_working):
         with pytest.raises(SessionError, match=re.escape(f"{file}: is damaged (entries.1.session: ")):
             take(tmp_path)
     assert {path for path in tmp_path.rglob("*") if not path.name.startswith(".")} <= set(before)

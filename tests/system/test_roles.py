@@ -9,8 +9,8 @@ import yaml
 from tests.system.virtual_stand import virtual_stand
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.guarding.rules import vital
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.guarding.rules import list_vital_channels
 
 THERMOMETERS: dict[str, dict[str, Any]] = {
     "base_plate": {"channel": 0, "role": "granite_inside", "certificate": "T-17"},
@@ -22,7 +22,7 @@ THERMOMETERS: dict[str, dict[str, Any]] = {
 
 
 def described(thermometers: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    data = yaml.safe_load(packaged("", "software-regulator").read_text())
+    data = yaml.safe_load(find_packaged("", "software-regulator").read_text())
     return data | {"axes": {}, "cameras": {}, "thermometers": thermometers}
 
 
@@ -61,7 +61,7 @@ async def test_a_safety_thermometer_that_reads_low_is_a_warning_for_it_guards_no
 
 
 def test_without_a_safety_thermometer_that_is_read_there_is_no_heat():
-    assert vital(config_of()) == (
+    assert list_vital_channels(config_of()) == (
         "regulator.pv",
         "thermometers.air",
         "thermometers.granite_inside",
@@ -70,9 +70,9 @@ def test_without_a_safety_thermometer_that_is_read_there_is_no_heat():
 
 
 def test_a_file_without_roles_means_what_it_did():
-    config = load_config(packaged("", "software-regulator"))
+    config = load_config(find_packaged("", "software-regulator"))
     assert list(config.sensors) == list(config.thermometers)
-    assert vital(config) == ("regulator.pv", "thermometers.air", "thermometers.granite_inside")
+    assert list_vital_channels(config) == ("regulator.pv", "thermometers.air", "thermometers.granite_inside")
 
 
 @pytest.mark.parametrize(

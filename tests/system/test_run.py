@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests import forked
+from tests import fork_server
 from tests.system.conftest import AS_INSTALLED, CORNER, SHORT_RECIPE, WHOLE_SENSOR
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.errors import ConfigError, SessionError, StandError, StandTripped, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
@@ -158,7 +158,7 @@ asyncio.run(run_virtual(order, out, None, watch))
 async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., Order], number: signal.Signals):
     ordered = order()
     command = [sys.executable, "-m", "tests.code", DAEMON]
-    daemon = forked.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    daemon = fork_server.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert daemon.stdin is not None
     assert daemon.stdout is not None
     daemon.stdin.write(pickle.dumps((ordered, tmp_path / "out")))
@@ -178,7 +178,7 @@ async def test_a_dead_daemon_does_not_heat(tmp_path: Path, order: Callable[..., 
         before, earlier = await control.request({"do": "state"}), before
     assert before["heater_enabled"] == 1
     assert isinstance(before["now_ns"], int)
-    off_ns = before["now_ns"] + seconds_ns(ordered.config.guard.heater_hold_s + 1)
+    off_ns = before["now_ns"] + to_ns(ordered.config.guard.heater_hold_s + 1)
     await control.advance(off_ns)  # a second later: what was on the wire arrives when time goes on
     after = await control.request({"do": "state"})
     assert after["heater_enabled"] == 0

@@ -22,7 +22,7 @@ from tests.system.conftest import SHORT_RECIPE
 from tests.system.resume_process import Daemon
 from tests.system.test_resume import end_laboratory
 from tests.system.test_run import at_step, ignore
-from thermostand.foundation import calls
+from thermostand.foundation import workers
 from thermostand.foundation.errors import NotReset, StandTripped
 from thermostand.foundation.events import AlertCause
 from thermostand.foundation.items import Event, Item, StepMark, StepState
@@ -30,7 +30,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import Interrupted, run_real, run_virtual
-from thermostand.stand.serving.alerts import AlertBook, AlertMessage
+from thermostand.stand.serving.alerts import AlertMessage, AlertTracker
 from thermostand.stand.simulator import Simulator
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
@@ -63,7 +63,7 @@ async def test_a_session_says_which_package_has_made_steps_of_its_plan(
 
 def messages(events: Sequence[Event]) -> list[AlertMessage]:
     """What receivers of all causes get of a night's events."""
-    book = AlertBook("lab", get_args(AlertCause), 0, 1000)
+    book = AlertTracker("lab", get_args(AlertCause), 0, 1000)
     return [each for event in events for each in (*book.receive(event, event.time_ns), *book.due(event.time_ns))]
 
 
@@ -131,7 +131,7 @@ def held_now() -> Counter[str]:
 def is_of_lane(frame: FrameType | None) -> bool:
     """Whether the thread that is there now serves a lane; such threads are not the threading module's."""
     while frame is not None:
-        if frame.f_code is calls._serve.__code__:
+        if frame.f_code is workers._serve.__code__:
             return True
         frame = frame.f_back
     return False

@@ -22,9 +22,9 @@ KEYED = {"add", "discard", "get", "pop", "setdefault", "count"}
 _SOURCE = re.compile(r"\.(text|reason|args)\b|\b(str|repr)\(")
 # Shown, not decided upon: the sentence of an error with the file's name as it is within the session.
 SHOWN = {
-    ("compensation/commands/photographs_cli.py", "views_of"),
+    ("compensation/commands/photographs_cli.py", "collect_views"),
     # Compared with what was said before and nothing else: whether a message repeats.
-    ("foundation/repeats.py", "_of_sentence"),
+    ("foundation/repeat_limit.py", "_admit_sentence"),
 }
 
 

@@ -20,7 +20,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.recording.writing.disk import MODULE
 from thermostand.stand.running.opening.writer_restarts import MOST_PER_H
 from thermostand.stand.running.order import Order
-from thermostand.stand.serving.desk import StandState
+from thermostand.stand.serving.api_models import StandState
 
 LEAVES_WITHIN_S = 8.0  # 5 s on an idle machine; the waits take 3.6 s (tests/stand/test_leaving.py)
 STOPPED_S = 1.5  # 6 periods of the guard

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from thermostand.compensation.drift.choosing import fit
 from thermostand.compensation.drift.drift_model import DriftModel
-from thermostand.compensation.drift.evaluation import rms_px
-from thermostand.compensation.drift.training import frame_states
+from thermostand.compensation.drift.evaluation import compute_rms_px
+from thermostand.compensation.drift.model_selection import fit
+from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.observations import Observations, observe
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
@@ -100,12 +100,12 @@ def true_centres(order: Order) -> object:
 def true_rms_mpx(model: DriftModel, third: Night) -> NDArray[np.float64]:
     """(2,) along I and J: what the model leaves of the true drift, mpx."""
     reference_px = third.true_px[third.observed.of(Role.REFERENCE)].mean(axis=0)
-    states = frame_states(third.observed, model.memory)
+    states = compute_frame_states(third.observed, model.memory)
     left_px = [
         reference_px - third.true_px[frame] - model.shift(third.true_px[frame], states.where(np.array([frame])))
         for frame in np.flatnonzero(third.observed.of(Role.VALIDATION))
     ]
-    return 1e3 * np.array(rms_px(np.concatenate(left_px)))
+    return 1e3 * np.array(compute_rms_px(np.concatenate(left_px)))
 
 
 async def test_settled_dwells_save_a_third_of_the_cycle_and_the_thermal_form_loses_little(

@@ -16,10 +16,10 @@ from thermostand.foundation.documents import parse_document
 from thermostand.recording.reading.scan import Files, verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.opening.stop import Interrupted
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import resume, run_virtual
 
 from .conftest import CALM, require_aravis
@@ -38,7 +38,7 @@ experiments:
 
 
 def order(data: dict[str, dict[str, object]], recipe: str) -> Order:
-    text, target = yaml.safe_dump(data), packaged("targets", "paper-9x6").read_text()
+    text, target = yaml.safe_dump(data), find_packaged("targets", "paper-9x6").read_text()
     return Order(
         parse_document(text, StandConfig, "config"), parse_document(recipe, Recipe, "recipe"), text, recipe, target
     )
@@ -49,7 +49,7 @@ def recorded(data: dict[str, dict[str, object]], recipe: str, out: Path) -> Path
 
 
 def simulated() -> dict[str, dict[str, object]]:
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     change(data, CALM)
     return data
 
@@ -89,7 +89,7 @@ def test_an_interrupted_run_of_two_cameras_is_resumed(tmp_path: Path):
     with pytest.raises(Interrupted):
         asyncio.run(run_virtual(order(data, CAPTURES), tmp_path, 1, stopped))
     (directory,) = tmp_path.glob("*-captures")
-    before = interruption(directory, load_config(packaged("", "simulated")))
+    before = load_interruption(directory, load_config(find_packaged("", "simulated")))
     asyncio.run(resume(before, lambda _: None))
     session = Session.open(directory)
     assert verify(directory).files is Files.SOUND

@@ -11,12 +11,12 @@ import pytest
 from tests.system.conftest import require_aravis
 from tests.system.test_several_cameras import simulated
 from thermostand.drivers.sim.gige.gvsp_sender import Switch
-from thermostand.foundation.clock import WallClock, seconds_ns
+from thermostand.foundation.clock import WallClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Frame
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.simulator import Simulator, laboratory_of, relocated
+from thermostand.stand.simulator import Simulator, describe_laboratory, relocate
 
 
 def test_what_a_switch_cannot_hold_is_lost():
@@ -36,12 +36,12 @@ def three_of(*, still: bool, **size_px: int) -> Generator[StandConfig]:
     for number, name in enumerate(["left", "right"]):
         data["cameras"][name] = {"address": f"127.0.0.{41 + number}", "serial_number": f"TS-{number}", **size}
     config = StandConfig.model_validate(data)
-    laboratory: dict[str, Any] = laboratory_of(config, virtual=False, seed=None, is_anywhere=True)
+    laboratory: dict[str, Any] = describe_laboratory(config, virtual=False, seed=None, is_anywhere=True)
     for name in config.cameras:
         laboratory["devices"][name]["settings"]["still"] = still
     simulator = Simulator(laboratory)
     try:
-        yield relocated(config, simulator.addresses)
+        yield relocate(config, simulator.addresses)
     finally:
         simulator.stop()
 
@@ -62,7 +62,7 @@ async def together(config: StandConfig, frames: int, period_s: float = 0.0) -> t
     await asyncio.gather(*(camera.grab() for camera in cameras.values()))  # the first opens the stream
     begin_ns, came = assembly.clock.now_ns(), list[list[Frame]]()
     for number in range(1, frames + 1):
-        due_ns = begin_ns + number * seconds_ns(period_s)
+        due_ns = begin_ns + number * to_ns(period_s)
         came.append(await asyncio.gather(*(camera.grab(None, due_ns) for camera in cameras.values())))
     late_s = max(frame.time_ns for frame in came[-1]) / 1e9 - (begin_ns / 1e9 + frames * period_s)
     await supply.switch_off()

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import yaml
 
-from tests import forked
+from tests import fork_server
 from tests.sections import change
 from tests.system.conftest import CALM, CORNER, SHORT_RECIPE, require_aravis
 from tests.system.test_run import digests
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 
 # A night as short as it can be.
 RECIPE = (
@@ -26,7 +26,7 @@ STAND = [sys.executable, "-m", "thermostand.stand.cli"]
 def begun(tmp_path: Path, name: str, *arguments: str) -> subprocess.Popen[str]:
     require_aravis()
     command = [*STAND, *arguments, "--virtual-time", "--out", str(tmp_path / name)]
-    return forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def ended(run: subprocess.Popen[str]) -> Path:
@@ -39,7 +39,7 @@ def test_two_virtual_nights_side_by_side_of_the_installed_configuration_give_the
     recipe = tmp_path / "short.yaml"
     recipe.write_text(RECIPE)
     config = tmp_path / "config.yaml"  # how full this machine's disk is adds no event
-    text = packaged("", "simulated").read_text()
+    text = find_packaged("", "simulated").read_text()
     config.write_text(text.replace("{directory: sessions}", "{directory: sessions, alert_below_percent: 0}"))
     assert "alert_below_percent: 0" in config.read_text()
     arguments = ("run", str(recipe), "--seed", "7", "--config", str(config))
@@ -53,7 +53,7 @@ def test_a_virtual_run_goes_on_and_a_new_one_begins_while_the_laboratory_of_a_ki
     """An orphaned laboratory lives for a minute; nobody waits for its addresses."""
     recipe, config = tmp_path / "short.yaml", tmp_path / "config.yaml"
     recipe.write_text(RECIPE)
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     change(data, CALM)
     data["cameras"]["camera"] |= CORNER
     config.write_text(yaml.safe_dump(data))
@@ -64,7 +64,9 @@ def test_a_virtual_run_goes_on_and_a_new_one_begins_while_the_laboratory_of_a_ki
     killed.kill()
     killed.communicate()
     (session,) = (tmp_path / "killed").iterdir()
-    resumed = forked.popen([*STAND, "resume", str(session)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    resumed = fork_server.popen(
+        [*STAND, "resume", str(session)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     new = begun(tmp_path, "new", *arguments)
     assert ended(resumed) == session
     assert Session.open(session).frame_count == Session.open(ended(new)).frame_count == 2

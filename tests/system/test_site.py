@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.stand.config.reference import reference
+from thermostand.stand.config.reference import make_reference
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,7 +63,7 @@ def test_no_page_loads_anything_from_elsewhere(site: Path):
 
 def test_the_reference_has_every_key_with_its_bounds():
     schema = json.loads((ROOT / "configs" / "schema" / "stand.json").read_text())
-    page = reference("A stand's file", schema)
+    page = make_reference("A stand's file", schema)
     for key in schema["properties"]:
         assert f"| `{key}` |" in page, key
     assert "## GuardConfig" in page

@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from tests.recording.declared import declared
+from tests.recording.device_declarations import declare_devices
 from tests.recording.disks import ext4, run
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.hub import Hub
@@ -49,11 +49,11 @@ async def publish(hub, clock, begin, count):
 async def test_a_frozen_disk_costs_counted_frames_and_neither_telemetry_nor_time(disk):
     clock, hub, events = WallClock(), Hub(), []
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
-    recorder = Recorder(disk / "s", INFO, {}, declared({"camera": "camera"}), hub, clock, settings=SETTINGS)
+    recorder = Recorder(disk / "s", INFO, {}, declare_devices({"camera": "camera"}), hub, clock, settings=SETTINGS)
     recorder.start()
     recording = asyncio.create_task(recorder.run())
     await publish(hub, clock, 0, 50)
-    await recorder.flushed()
+    await recorder.flush()
     run("fsfreeze", "-f", disk)
     try:
         late_s = await publish(hub, clock, 50, FROZEN_TICKS)
@@ -62,7 +62,7 @@ async def test_a_frozen_disk_costs_counted_frames_and_neither_telemetry_nor_time
     finally:
         run("fsfreeze", "-u", disk)
     await publish(hub, clock, 50 + FROZEN_TICKS, 50)
-    await recorder.flushed()
+    await recorder.flush()
     saved = recorder.saved
     recording.cancel()
     with suppress(asyncio.CancelledError):

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.system.regulator_steps import steps_of, tuned_in
+from tests.system.regulator_steps import autotune_in, steps_of
 from tests.system.virtual_stand import LIMIT_S, REAL_TIME, VirtualStand, bare_config, heating_process, virtual_stand
 from thermostand.drivers.devices.regulators.pid import Law
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulator
 from thermostand.foundation.errors import DeviceFault, Occupied, Refused
-from thermostand.stand.service.by_hand import ByHand
+from thermostand.stand.service.manual_control import ManualControl
 
 RELAYS, HEAT = 2, 3  # unit, its relay
 
@@ -37,7 +37,7 @@ async def heats(stand: VirtualStand) -> bool:
 async def test_it_finds_its_law_about_a_set_point_and_goes_on_without_a_bump(tmp_path: Path):
     config = bare_config("software-regulator", tmp_path, {"regulator": {"law": Law().model_dump(mode="json")}})
     async with virtual_stand(config) as stand:
-        regulator, by_hand = regulator_of(stand), ByHand(stand.assembly, lambda: None)
+        regulator, by_hand = regulator_of(stand), ManualControl(stand.assembly, lambda: None)
         tuning = asyncio.create_task(by_hand.work("regulator", "autotune", {"setpoint_degC": 40}))
         await stand.wait(1200)
         refused = 0
@@ -187,6 +187,6 @@ async def test_a_process_that_is_stopped_gives_no_heat_after_its_last_pulse(tmp_
 @pytest.mark.nightly
 def test_autotuned_it_holds_a_tenth_and_overshoots_less_than_half_a_kelvin_in_the_standard_and_drawn_chambers():
     for seed in (None, 4, 7, 9):
-        for step in steps_of("software-regulator", seed, tuned_in(seed)):
+        for step in steps_of("software-regulator", seed, autotune_in(seed)):
             assert step.overshoot_K < 0.5
             assert step.worst_K < 0.1

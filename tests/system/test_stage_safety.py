@@ -17,12 +17,12 @@ from thermostand.drivers.devices.thermometers import Thermometers
 from thermostand.drivers.wires.bus import Bus, BusSettings
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
 from thermostand.drivers.wires.registers import load_register_map
-from thermostand.foundation.clock import Clock, WallClock, seconds_ns
+from thermostand.foundation.clock import Clock, WallClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Refused, Superseded
 from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
-from thermostand.stand.config.stand_config import CompressorConfig, packaged
+from thermostand.stand.config.stand_config import CompressorConfig, find_packaged
 from thermostand.stand.fault import Fault
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.interlock import Interlocked
@@ -47,7 +47,7 @@ async def test_make_safe_stops_a_running_move_and_the_move_says_so(bench: Bench)
     assert (await axis.read())[1].value == 0
     with pytest.raises(Superseded, match=r"^linear: superseded"):
         await move
-    await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(10.0))
+    await bench.clock.sleep_until(bench.clock.now_ns() + to_ns(10.0))
     assert bench.mechanical == stopped
     assert await axis.homed()
     assert bench.tap.count("stop") == 0
@@ -176,7 +176,7 @@ async def test_made_safe_while_what_comes_before_a_motion_is_answered_the_motion
 def stand_with(axis: Axis, clock: Clock) -> Stand:
     """A stand of which only this axis answers."""
     bus = Bus("bus", BusSettings(address="tcp:127.0.0.1:9"), clock)
-    maps = [load_register_map(packaged("registers", name)) for name in ("omron-e5cc", "waveshare-relay")]
+    maps = [load_register_map(find_packaged("registers", name)) for name in ("omron-e5cc", "waveshare-relay")]
     relays = Relays("relays", bus, maps[1], {"heater_enable": 0, "compressor": 1, "camera_power": 2})
     regulator, flap = Regulator("regulator", bus, maps[0], clock), Flap("flap", FLAP, clock, None)
     camera = AravisCamera("camera", GigeCameraSettings(address="127.0.0.1"), clock)

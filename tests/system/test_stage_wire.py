@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from thermostand.drivers.devices.motion.stage import AxisSettings
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import DeviceFault, Refused
 from thermostand.foundation.readings import Quality, Reading
 
@@ -294,7 +294,7 @@ async def test_a_motor_without_current_is_doubtful_and_the_same_target_approache
 async def test_the_profile_switches_the_motor_off_after_a_minute_and_the_reading_tells(bench: Bench) -> None:
     axis = await bench.ready()
     await axis.move_to(10.001)
-    await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(59.0))
+    await bench.clock.sleep_until(bench.clock.now_ns() + to_ns(59.0))
     assert (await bench.position()).quality is Quality.GOOD
-    await bench.clock.sleep_until(bench.clock.now_ns() + seconds_ns(2.0))
+    await bench.clock.sleep_until(bench.clock.now_ns() + to_ns(2.0))
     assert (await bench.position()).quality is Quality.STALE

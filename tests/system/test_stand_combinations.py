@@ -24,25 +24,25 @@ from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
 from thermostand.stand.assembly import assemble
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import StandConfig, packaged
-from thermostand.stand.estimating.absent import absences
+from thermostand.stand.config.stand_config import StandConfig, find_packaged
+from thermostand.stand.estimating.missing_devices import list_missing_devices
 from thermostand.stand.running.order import Order, check_plan
-from thermostand.stand.service.hands_on import known_devices
+from thermostand.stand.service.bench import list_devices
 from thermostand.stand.service.run import run_virtual
-from thermostand.stand.simulator import laboratory_of
+from thermostand.stand.simulator import describe_laboratory
 
 Data = dict[str, Any]
-SIMULATED: Data = yaml.safe_load(packaged("", "simulated").read_text())
-SOFTWARE: Data = yaml.safe_load(packaged("", "software-regulator").read_text())
-TARGET = packaged("targets", "paper-9x6").read_text()
+SIMULATED: Data = yaml.safe_load(find_packaged("", "simulated").read_text())
+SOFTWARE: Data = yaml.safe_load(find_packaged("", "software-regulator").read_text())
+TARGET = find_packaged("targets", "paper-9x6").read_text()
 STAGE = {"overshoot": 0.5, "acceleration": 1000, "deceleration": 1000, "source": "of nobody, p. 1"}
 OTHER_STAGE = {**STAGE, "unit": "mm", "unit_per_step": 0.01, "travel": 100, "speed": 3000, "homing_speed": 1000}
-BOARD = packaged("registers", "waveshare-relay")
+BOARD = find_packaged("registers", "waveshare-relay")
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One way to fill a place: what it does to the stand's file, and what `absences` then says ("no flap")."""
+    """One way to fill a place: what it does to the stand's file, and what `list_missing_devices` names ("no flap")."""
 
     name: str
     change: Callable[[Data], object]
@@ -246,7 +246,7 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
     if data["cameras"] and config.relays is None:
         with pytest.raises(ConfigError, match="no relay switches"):
             check_plan(recipe([{"power_camera": False}]).plan(), config)
-    said = [f"no {each.what}" for each in absences(config)]
+    said = [f"no {each.what}" for each in list_missing_devices(config)]
     expected = [absent for choice in combination for absent in choice.absent]
     if "granite_inside" in data["thermometers"]:  # ours is not controlled by the only one
         expected = [each for each in expected if each not in NO_GRANITE]
@@ -262,11 +262,11 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
     assert [device is not None for device in (devices.heat_module, devices.inputs, devices.imager)] == [
         name in data for name in ("heat_module", "inputs", "imager")
     ]
-    assert {each.name for each in known_devices(config)} >= {
+    assert {each.name for each in list_devices(config)} >= {
         *(name for name in ("flap", "heat_module", "inputs", "imager") if name in data),
         *(name for key in ("axes", "cameras", "probes") for name in data.get(key, {})),
     }
-    described = cast("dict[str, Any]", laboratory_of(config, virtual=True, seed=1)["devices"])
+    described = cast("dict[str, Any]", describe_laboratory(config, virtual=True, seed=1)["devices"])
     assert described["thermometers"]["settings"]["channels"] == {
         name: each.channel for name, each in config.sensors.items()
     }
@@ -288,7 +288,7 @@ async def test_each_combination_runs_and_records_what_it_lacks(combination: Comb
     checked = verify(session.path)  # all that each kind of device declares is read
     assert checked.is_sound, checked.findings
     reported = [event.data["what"] for event in session.events() if event.kind == "absent"]
-    assert reported == [each.what for each in absences(order.config)]
+    assert reported == [each.what for each in list_missing_devices(order.config)]
     air_degC = session.readings("thermometers.air")[1]
     assert len(air_degC) > 10
     assert all(len(session.readings(f"thermometers.{name}")[1]) == len(air_degC) for name in order.config.sensors)

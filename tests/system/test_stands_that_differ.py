@@ -11,8 +11,8 @@ from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import load_config, packaged
-from thermostand.stand.estimating.absent import absences
+from thermostand.stand.config.stand_config import find_packaged, load_config
+from thermostand.stand.estimating.missing_devices import list_missing_devices
 from thermostand.stand.running.order import Order, check_plan
 from thermostand.stand.service.run import run_virtual
 
@@ -60,7 +60,7 @@ def build(tmp_path: Path, config_text: Callable[..., str]) -> Callable[..., Orde
         config_file, recipe_file = tmp_path / "stand.yaml", tmp_path / "recipe.yaml"
         config_file.write_text(yaml.safe_dump(data))
         recipe_file.write_text(recipe)
-        target = packaged("targets", "paper-9x6").read_text()
+        target = find_packaged("targets", "paper-9x6").read_text()
         loaded = load_document(recipe_file, Recipe)
         return Order(load_config(config_file), loaded, config_file.read_text(), recipe, target)
 
@@ -94,7 +94,7 @@ async def test_sixteen_thermometers_other_stages_and_instruments_are_one(tmp_pat
 
 
 def test_what_a_stand_lacks_is_said_before_it_runs(build: Callable[..., Order]):
-    assert absences(build(lambda data: None, RECIPE).config) == ()
+    assert list_missing_devices(build(lambda data: None, RECIPE).config) == ()
     with pytest.raises(ConfigError, match="needs a camera"):
         check_plan(
             Recipe.model_validate(yaml.safe_load(RECIPE + FRAMES)).plan(),

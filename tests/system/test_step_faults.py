@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.asking import ask
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from tests.daemon_queries import ask
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.exit_codes import FAILED, NOT_RESET
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
-from thermostand.foundation.tasks import cancelled
+from thermostand.foundation.tasks import cancel_all
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.gate import INTERLOCK
@@ -64,13 +64,13 @@ class Operator:
         hub.subscribe(self._receive)
 
     async def leave(self) -> None:
-        await cancelled(self._asking)
+        await cancel_all(self._asking)
 
     def _receive(self, item: Item) -> None:
         if isinstance(item, Event) and item.kind.startswith("guard.") and item.data.get("action") == "hold":
             self.holds.append((str(item.data["rule"]), bool(item.data["ends_itself"])))
             if not item.data["ends_itself"]:
-                self._due_ns = item.time_ns + seconds_ns(self.after_s)
+                self._due_ns = item.time_ns + to_ns(self.after_s)
         if isinstance(item, Batch) and self._due_ns is not None and item.time_ns >= self._due_ns:
             self._due_ns = None
             self._asking.append(asyncio.create_task(asyncio.to_thread(ask, self.directory, "reset")))
@@ -119,7 +119,7 @@ async def test_what_still_stands_when_it_is_cleared_holds_again_at_once(
     assert operator.holds == [(rule, False)] * 3
     held = [event for event in session.events() if event.data.get("reason") == INTERLOCK]
     assert [event.kind for event in held] == ["held", "released"] * 3
-    assert all((held[i].time_ns - held[i - 1].time_ns) < seconds_ns(5.0) for i in (2, 4))
+    assert all((held[i].time_ns - held[i - 1].time_ns) < to_ns(5.0) for i in (2, 4))
 
 
 async def test_the_rule_of_a_lost_flap_takes_over_from_the_step_that_has_met_it(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from tests import forked
+from tests import fork_server
 from tests.system.conftest import FAST
 from tests.system.gateway import gateway
 from tests.system.test_unrecorded_heat import SOAK, heater_is, plant
@@ -40,7 +40,7 @@ async def test_after_a_stop_heat_waits_for_readings_taken_since(
         config["bus"]["address"] = through.config.bus.address
         (tmp_path / "through.yaml").write_text(yaml.safe_dump(config))
         run = ["run", tmp_path / "recipe.yaml", "--config", tmp_path / "through.yaml", "--out", tmp_path / "out"]
-        process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
+        process = fork_server.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
         asked, answered = list[bytes](), list[bytes]()
 
         def loses(request: bytes) -> bool:

@@ -13,16 +13,16 @@ import pytest
 import yaml
 
 from tests.addresses import move_to_free
-from tests.asking import ask
+from tests.daemon_queries import ask
 from tests.system.test_run import fault
 from thermostand.foundation.errors import SessionError, StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepState
-from thermostand.recording.reading.run_word import RunOutcome
+from thermostand.recording.reading.run_status import RunOutcome
 from thermostand.recording.reading.session import Session
-from thermostand.stand.config.stand_config import packaged
+from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.running.order import Order, load_order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
 RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}\n  - stop_chamber\n"
@@ -30,7 +30,7 @@ RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}
 
 async def night(folder: Path, set_point: float, soak_s: int = 900, **ending: object) -> tuple[Session, list[Event]]:
     """A run of a stand without a camera that ends away from the laboratory's 24 degC."""
-    data = yaml.safe_load(packaged("", "simulated").read_text())
+    data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["cameras"], data["axes"] = {}, {}
     data["ending"] = {"to_ambient": True, **ending}
     (folder / "stand.yaml").write_text(yaml.safe_dump(data))
@@ -98,7 +98,7 @@ def on_the_way(do: Callable[[], object], batches: int = 5) -> Callable[[Hub], No
 def far(folder: Path) -> Order:
     """Of a stand that knows its laboratory's temperature from its file only: 18 degC, where a new simulated chamber is
     at 24, so that a resumed run has a way to go, too."""
-    data = move_to_free(yaml.safe_load(packaged("", "simulated").read_text()), folder)
+    data = move_to_free(yaml.safe_load(find_packaged("", "simulated").read_text()), folder)
     data["cameras"], data["axes"] = {}, {}
     data["thermometers"].pop("laboratory")
     data["ending"] = {"to_ambient": True, "ambient_degC": 18.0}
@@ -122,7 +122,7 @@ def test_a_stop_on_the_way_back_leaves_the_stand_safe_and_a_resume_goes_on_with_
         asyncio.run(run_virtual(far(tmp_path), tmp_path / "out", None, on_the_way(interrupt)))
     (directory,) = (tmp_path / "out").glob("*-away")
     assert "at_ambient" not in check_ended(directory, "aborted")
-    assert asyncio.run(resume(interruption(directory), lambda hub: None)) == directory
+    assert asyncio.run(resume(load_interruption(directory), lambda hub: None)) == directory
     kinds = check_ended(directory, "aborted", "complete")
     assert kinds.count("to_ambient") == 2
     assert kinds.index("at_ambient") > kinds.index("run.resume")
@@ -148,8 +148,8 @@ async def test_a_trip_on_the_way_back_ends_it_and_it_goes_on_when_that_is_cleare
     (directory,) = (tmp_path / "out").glob("*-away")
     check_ended(directory, "aborted")
     with pytest.raises(SessionError, match="resume with --reset"):
-        interruption(directory)
-    await resume(interruption(directory, reset=True), lambda hub: None)
+        load_interruption(directory)
+    await resume(load_interruption(directory, reset=True), lambda hub: None)
     assert "at_ambient" in check_ended(directory, "aborted", "complete")
 
 

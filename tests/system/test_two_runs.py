@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from tests import forked
-from tests.asking import ask_status
+from tests import fork_server
+from tests.daemon_queries import ask_status
 from tests.stand.test_listening import connected
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
 from thermostand.foundation.errors import SessionError
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.order import Order
-from thermostand.stand.serving.client import running_sessions
+from thermostand.stand.serving.client import list_running_sessions
 from thermostand.stand.simulator import ControlSocket
 
 LIMIT_S = 90.0  # for a busy machine
@@ -35,7 +35,7 @@ def stand(tmp_path: Path) -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
 
     def start(*arguments: str | Path) -> "subprocess.Popen[str]":
         command = [sys.executable, "-m", "thermostand.stand.cli", *arguments]
-        started.append(forked.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        started.append(fork_server.popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         return started[-1]
 
     yield start
@@ -87,7 +87,7 @@ async def test_a_second_run_touches_nothing_until_the_first_has_ended(
     run = ("run", tmp_path / "recipe.yaml", "--config", tmp_path / "config.yaml", "--out")
     async with Laboratory(tmp_path / "config.yaml") as laboratory:
         first = stand(*run, out)
-        await until(lambda: bool(running_sessions(out)), first)
+        await until(lambda: bool(list_running_sessions(out)), first)
         async with asyncio.timeout(LIMIT_S):
             while not await laboratory.heater_is_on():
                 assert first.poll() is None
@@ -125,7 +125,7 @@ async def test_a_second_run_touches_nothing_until_the_first_has_ended(
             ask_status(renamed)
 
         third = stand(*run, other)
-        await until(lambda: bool(running_sessions(other)), third)
+        await until(lambda: bool(list_running_sessions(other)), third)
         stopping = stand("stop", other)
         assert await asyncio.to_thread(stopping.wait, LIMIT_S) == 0
         assert await asyncio.to_thread(third.wait, LIMIT_S) == 130

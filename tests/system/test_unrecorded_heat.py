@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.asking import ask, ask_status
+from tests.daemon_queries import ask, ask_status
 from tests.recording.disks import ext4
 from tests.system.conftest import FAST
 from tests.system.test_disk_process import frozen, gone
@@ -24,7 +24,7 @@ from thermostand.recording.repair.salvage import salvage_session
 from thermostand.recording.writing.disk import MODULE
 from thermostand.stand.running.opening.writer_restarts import MOST_PER_H
 from thermostand.stand.running.order import Order
-from thermostand.stand.running.resume import interruption
+from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import run_real
 from thermostand.stand.simulator import ControlSocket
 
@@ -165,7 +165,7 @@ async def test_a_run_whose_disk_process_is_killed_goes_on_with_another_until_it_
     (directory,) = (tmp_path / "out").glob("2*")
     assert salvage_session(directory)
     assert "run.start" in [event.kind for event in Session.open(directory).events()]
-    before = interruption(directory)
+    before = load_interruption(directory)
     before.release()
     assert before.state.done or before.state.soaked_s
     begun = [event.kind for event in Session.open(directory).events() if event.kind in ("run.start", "run.resume")]

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import yaml
 
-from tests import forked
+from tests import fork_server
 from tests.sections import change
-from thermostand.foundation.clock import VirtualClock, seconds_ns
+from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.stand.assembly import Assembly, assemble
-from thermostand.stand.config.stand_config import StandConfig, load_config, packaged
-from thermostand.stand.running.opening.open_stand import OpenStand, opened
+from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
+from thermostand.stand.running.opening.open_stand import OpenStand, open_assembly
 from thermostand.stand.running.opening.stop import Stop
-from thermostand.stand.simulator import ControlSocket, Simulator, laboratory_of, relocated
+from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory, relocate
 
 
 @dataclass
@@ -50,12 +50,12 @@ class VirtualStand:
         return (self.clock.now_ns() - self.begin_ns) / 1e9
 
     async def wait(self, duration_s: float) -> None:
-        await self.clock.sleep_until(self.clock.now_ns() + seconds_ns(duration_s))
+        await self.clock.sleep_until(self.clock.now_ns() + to_ns(duration_s))
 
     async def hold(self, set_point_degC: float, duration_s: float) -> None:
         """Go to a set-point and stay there."""
         chamber = self.assembly.stand.chamber
-        go = chamber.set_temperature if chamber.permits.granted else chamber.start
+        go = chamber.set_temperature if chamber.permits.is_granted else chamber.start
         await go(set_point_degC)
         await self.wait(duration_s)
 
@@ -76,7 +76,7 @@ class VirtualStand:
 
 def bare_config(name: str, folder: Path, sections: Mapping[str, dict[str, object]] | None = None) -> StandConfig:
     """An installed stand's file without stages and cameras; `sections` replaces entries."""
-    data = yaml.safe_load(packaged("", name).read_text())
+    data = yaml.safe_load(find_packaged("", name).read_text())
     data |= {"axes": {}, "cameras": {}}
     change(data, dict(sections or {}))
     path = folder / f"{name}.yaml"
@@ -88,16 +88,18 @@ def bare_config(name: str, folder: Path, sections: Mapping[str, dict[str, object
 async def virtual_stand(config: StandConfig) -> AsyncGenerator[VirtualStand]:
     """With a simulated laboratory of its own, at free addresses."""
     assert config.simulation is not None
-    begin_ns = seconds_ns(config.simulation.start.timestamp())
+    begin_ns = to_ns(config.simulation.start.timestamp())
     async with Stop(has_signals=False) as stop, AsyncExitStack() as stack:
-        simulator = await asyncio.to_thread(Simulator, laboratory_of(config, virtual=True, seed=None, is_anywhere=True))
+        simulator = await asyncio.to_thread(
+            Simulator, describe_laboratory(config, virtual=True, seed=None, is_anywhere=True)
+        )
         stack.push_async_callback(asyncio.to_thread, simulator.stop)
         control = ControlSocket(simulator.addresses["control"])
         stack.push_async_callback(control.close)
         await control.open()
         clock = VirtualClock(begin_ns, control.advance)
-        assembly = assemble(relocated(config, simulator.addresses), Hub(), clock)
-        open_stand = await stack.enter_async_context(opened(assembly, clock.run, stop, is_for_one=True))
+        assembly = assemble(relocate(config, simulator.addresses), Hub(), clock)
+        open_stand = await stack.enter_async_context(open_assembly(assembly, clock.run, stop, is_for_one=True))
         stand = VirtualStand(assembly, open_stand, control, clock, begin_ns)
         assembly.hub.subscribe(stand.receive)
         open_stand.prepare()
@@ -127,7 +129,7 @@ PlantQuantity = Callable[[str], Awaitable[float]]
 @asynccontextmanager
 async def heating_process(path: Path) -> AsyncGenerator[tuple[subprocess.Popen[str], PlantQuantity]]:
     """A run of the stand in that file, which soaks and heats; and what tells a quantity of its plant."""
-    simulated = laboratory_of(load_config(path), virtual=False, seed=None, is_anywhere=True)
+    simulated = describe_laboratory(load_config(path), virtual=False, seed=None, is_anywhere=True)
     simulator = await asyncio.to_thread(Simulator, simulated)
     control = ControlSocket(simulator.addresses["control"])
     await control.open()
@@ -143,7 +145,7 @@ async def heating_process(path: Path) -> AsyncGenerator[tuple[subprocess.Popen[s
     recipe = path.with_name("recipe.yaml")
     recipe.write_text(SOAK_RECIPE)
     run = ["run", recipe, "--config", path, "--out", path.with_name("out")]
-    process = forked.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
+    process = fork_server.popen([sys.executable, "-m", "thermostand.stand.cli", *run], stdout=subprocess.DEVNULL)
     try:
         async with asyncio.timeout(LIMIT_S):
             while await plant("heater_W") == 0:

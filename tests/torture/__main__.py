@@ -14,11 +14,11 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from functools import partial
 from pathlib import Path
 
-from tests import forked
+from tests import fork_server
 from tests.torture.case import draw, read_case, write_case
 from tests.torture.coverage import Reached
 from tests.torture.real import draw_real
-from tests.torture.rig import Result, perform, perform_seed, shrunk, told
+from tests.torture.rig import Result, format_result, perform, perform_seed, shrink
 
 
 def say(text: str) -> None:
@@ -41,7 +41,7 @@ def main() -> int:
         "--shrink", type=int, default=0, metavar="TRIES", help="of a broken case, by at most so many runs"
     )
     given = parser.parse_args()
-    forks = forked.Forks()
+    forks = fork_server.Forks()
     try:
         results, left = _results(given)
         return _report(results, left, given)
@@ -73,7 +73,7 @@ def _performed(seeds: Iterable[int], end_s: float, given: argparse.Namespace) ->
         iter(seeds),
         set[Future[Result]](),
     )
-    with ProcessPoolExecutor(jobs, context, forked.be_served, (forked.served_at(),)) as pool:
+    with ProcessPoolExecutor(jobs, context, fork_server.be_served, (fork_server.served_at(),)) as pool:
         while True:
             while len(under_way) < jobs and time.monotonic() < end_s and (seed := next(left, None)) is not None:
                 under_way.add(pool.submit(perform_one, seed))
@@ -89,15 +89,15 @@ def _report(results: Iterator[Result], left: Callable[[int, float], float], give
         count, simulated_s, broken = count + 1, simulated_s + result.simulated_s, broken + bool(result.violations)
         reached.add(result)
         minutes_left = left(count, time.monotonic() - begun_s) / 60.0
-        first, *more = told(result)
+        first, *more = format_result(result)
         say("\n".join([f"{first}    [{count} cases, {minutes_left:.0f} min left]", *more]))
         if result.violations and given.shrink:
-            least = write_case(shrunk(result.case, result.broken, given.shrink))
+            least = write_case(shrink(result.case, result.broken, given.shrink))
             (path := Path(tempfile.gettempdir()) / f"torture-{result.case.seed}.yaml").write_text(least)
             say(f"python -m tests.torture --case {path}    what is left of it:\n{least}")
     minutes = (time.monotonic() - begun_s) / 60.0
     say(f"{count} cases, {broken} broken; {simulated_s / 3600.0:.1f} simulated hours in {minutes:.1f} min")
-    say("\n".join(reached.told()))
+    say("\n".join(reached.format_lines()))
     return int(broken > 0)
 
 

@@ -11,8 +11,8 @@ from tests.torture.real import KINDS as REAL
 from tests.torture.rig import Result
 from thermostand.drivers.sim.laboratory_faults import FAULTS
 from thermostand.foundation.events import GUARD
-from thermostand.stand.commands.remedies import rows
-from thermostand.stand.running.memory.entries import Written
+from thermostand.stand.commands.remedies import list_event_kinds
+from thermostand.stand.running.memory.entries import JournalEntry
 
 SITUATIONS = ("between", "soak", "capture", "step", "held", "tripped", "ended")
 """Of a run, as its journal shows them: what is under way, or why nothing is."""
@@ -24,7 +24,7 @@ class Reached:
     also in each situation of a run (the rows of its table), and ends of the program."""
 
     def __init__(self, *, is_real: bool = False) -> None:
-        self._known = everything(is_real=is_real)
+        self._known = list_everything(is_real=is_real)
         self.counts: dict[str, Counter[str]] = {
             name: Counter() for name in ("kinds", "rules", "events", "entries", "rows", "ends")
         }
@@ -38,10 +38,10 @@ class Reached:
         counts["rules"].update(result.rules)
         counts["events"].update(result.events)
         counts["entries"].update(str(entry["entry"]) for entry in result.journal)
-        counts["rows"].update(rows_of(result.journal, result.steps))
+        counts["rows"].update(iterate_rows(result.journal, result.steps))
         counts["ends"].update(str(life.status) for life in result.lives)
 
-    def told(self) -> Iterator[str]:
+    def format_lines(self) -> Iterator[str]:
         """Two lines for each: what was, and what was not."""
         known = self._known
         for name, counts in self.counts.items():
@@ -50,21 +50,21 @@ class Reached:
                 yield f"{name} never reached ({len(missing)} of {len(known[name])}): {', '.join(missing)}"
 
 
-def everything(*, is_real: bool) -> Mapping[str, set[str]]:
+def list_everything(*, is_real: bool) -> Mapping[str, set[str]]:
     """All that there is in that leg, as the tables name it."""
-    own = {each.__name__ for each in get_args(Written)}
+    own = {each.__name__ for each in get_args(JournalEntry)}
     during = {f"{each}: {entry}" for each in SITUATIONS[:-1] for entry in own - {"Begun"}}
     misplaced = {f"{each}: {entry}" for each in SITUATIONS[:-2] for entry in _OF_A_TRIP}
     return {
         "kinds": {"kill", *(REAL.keys() | FAULTS.keys() if is_real else KINDS.keys() | set(ORDERS))},
-        "rules": {row.removeprefix(GUARD) for row in rows() if row.startswith(GUARD)},
-        "events": {row for row in rows() if not row.startswith(GUARD)},
+        "rules": {row.removeprefix(GUARD) for row in list_event_kinds() if row.startswith(GUARD)},
+        "events": {row for row in list_event_kinds() if not row.startswith(GUARD)},
         "entries": own,
         "rows": {"between: Begun", *(f"ended: {entry}" for entry in _AT_AN_END), *during} - misplaced,
     }
 
 
-def rows_of(journal: Sequence[Mapping[str, Any]], steps: Mapping[str, str]) -> Iterator[str]:
+def iterate_rows(journal: Sequence[Mapping[str, Any]], steps: Mapping[str, str]) -> Iterator[str]:
     """In which situation each entry was written. steps: the kind of each step by its id."""
     under_way, held, ended, tripped = "", set[str](), False, False
     for entry in journal:

@@ -19,12 +19,12 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from tests import forked
+from tests import fork_server
 from tests.torture.case import Case
 from tests.torture.laboratory import TRUTH
 from tests.torture.lives import COMPLETE, KILLED, ROOT, Life
 from tests.torture.real import KINDS as REAL
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 
 ROW = np.dtype([("time_ns", "<i8"), *((name, "<f8") for name in TRUTH)])
 CENTRES = np.dtype([("time_ns", "<i8"), ("xy_px", "<f8", (54, 2))])
@@ -36,7 +36,7 @@ GIVEN_UP = "segment_given_up"
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class RecordedEvent:
     """An event of the recording."""
 
     time_ns: int
@@ -81,7 +81,7 @@ class Evidence:
     folder: Path
     lives: Sequence[Life]
     unreadable: list[str] = field(default_factory=list)
-    said: list[Said] = field(default_factory=list)
+    events: list[RecordedEvent] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     frames: Counter[tuple[str, int]] = field(default_factory=Counter)
     metas: list[tuple[int, str, str]] = field(default_factory=list)
@@ -91,12 +91,12 @@ class Evidence:
         self.stand = yaml.safe_load((self.folder / "stand.yaml").read_text())
         self.session = next(iter(sorted((self.folder / "out").glob("*/journal.jsonl"))), self.folder / "none/x").parent
         self._read_all()
-        if self.is_complete and any(said.kind == GIVEN_UP for said in self.said):
-            for found in (self.unreadable, self.said, self.marks, self.frames, self.metas, self.temperatures):
+        if self.is_complete and any(said.kind == GIVEN_UP for said in self.events):
+            for found in (self.unreadable, self.events, self.marks, self.frames, self.metas, self.temperatures):
                 found.clear()
             for session in self.sessions:
                 program = [sys.executable, "-m", "thermostand.stand.cli", "session", "repair", str(session)]
-                forked.run(program, cwd=ROOT, capture_output=True)
+                fork_server.run(program, cwd=ROOT, capture_output=True)
             self._read_all()
 
     def _read_all(self) -> None:
@@ -240,7 +240,7 @@ class Evidence:
     def _take(self, topic: str, time_ns: int, message: Any) -> None:
         if topic == "/experiment/event":
             data = json.loads(message.data_json or "{}")
-            self.said.append(Said(time_ns, message.level, message.kind, message.text, data))
+            self.events.append(RecordedEvent(time_ns, message.level, message.kind, message.text, data))
         elif topic == "/experiment/step":
             parameters = json.loads(message.parameters_json or "{}")
             self.marks.append(Mark(time_ns, message.step_id, message.kind, message.state, parameters))
@@ -283,7 +283,7 @@ class RealEvidence(Evidence):
         """As `truth`; what has armed the relay before a daemon began counts, too."""
         count = len(list(self.folder.glob("wire-*.jsonl")))
         whole = [each for number in range(count) for each in self._bus(number)]
-        before_ns = seconds_ns(self.hold_s + 2 * STEP_S)
+        before_ns = to_ns(self.hold_s + 2 * STEP_S)
         return [
             [
                 replace(each, time_ns=each.time_ns + life.offset_ns)
@@ -322,7 +322,7 @@ class RealEvidence(Evidence):
     def off_from_ns(self, life: int) -> int:
         """From when on, after that life's end, everything is off."""
         ended = self.lives[life]
-        return ended.ended_ns + ended.offset_ns + seconds_ns(self.hold_s + 2 * STEP_S)
+        return ended.ended_ns + ended.offset_ns + to_ns(self.hold_s + 2 * STEP_S)
 
     def excused(self, at_s: float, *names: str, after_s: float = 0.0) -> bool:
         """As for virtual time; what is as good as such a fault counts."""
@@ -335,7 +335,7 @@ class RealEvidence(Evidence):
     def killed_soon(self, at_s: float, within_s: float) -> bool:
         """As for virtual time; what wrote for the daemon counts, and a run's end, behind which the process that writes
         the record between runs has to start."""
-        ends_s = [self.at_s(said.time_ns) for said in self.said if said.kind == "run.end"]
+        ends_s = [self.at_s(said.time_ns) for said in self.events if said.kind == "run.end"]
         deaths_s = [order.at_s for order in self.case.orders if order.verb == "disk_process_killed"]
         return super().killed_soon(at_s, within_s) or any(
             0 <= death_s - at_s <= within_s for death_s in (*deaths_s, *(end_s + within_s for end_s in ends_s))

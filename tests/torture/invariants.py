@@ -16,7 +16,7 @@ from enum import Flag, auto
 
 import numpy as np
 
-from tests import forked
+from tests import fork_server
 from tests.torture.evidence import STEP_S, Evidence
 from tests.torture.lives import COMPLETE, KILLED, ROOT
 
@@ -124,7 +124,7 @@ def heat_needs_fresh_readings(evidence: Evidence) -> Iterator[str]:
 @invariant(Leg.BOTH)
 def nothing_heats_unrecorded(evidence: Evidence) -> Iterator[str]:
     """No heat before the run's begin is recorded."""
-    begun = [said.time_ns for said in evidence.said if said.kind in ("run.start", "run.resume")]
+    begun = [said.time_ns for said in evidence.events if said.kind in ("run.start", "run.resume")]
     for truth in evidence.truth:
         heats = (truth["heater_enabled"] > 0) & (truth["heater_on_fraction"] > 0) & (truth["cut_out_open"] == 0)
         for row in truth[heats][:1]:
@@ -156,7 +156,7 @@ def compressor_rests(evidence: Evidence) -> Iterator[str]:
 def _holds(evidence: Evidence) -> Iterator[tuple[int, int]]:
     """From when to when the guard's interlock held the run."""
     begun_ns = None
-    for said in sorted(evidence.said, key=lambda each: each.time_ns):
+    for said in sorted(evidence.events, key=lambda each: each.time_ns):
         is_interlock = said.data.get("reason") == "interlock"
         if said.kind == "held" and is_interlock:
             begun_ns = begun_ns or said.time_ns
@@ -274,15 +274,15 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
             at_s = evidence.at_s(row["time_ns"])
             yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {there} are there"
     skipped = {entry.get("step_id") for entry in evidence.journal if entry["entry"] == "Skipped"}
-    lost = {said.data.get("step_id") for said in evidence.said if "lost" in said.kind or "dropped" in said.kind}
+    lost = {said.data.get("step_id") for said in evidence.events if "lost" in said.kind or "dropped" in said.kind}
     times_ns = {time_ns for _, time_ns in evidence.frames}
-    begun_ns = {said.data["step_id"]: said.time_ns for said in evidence.said if said.kind == "capture_restarted"}
+    begun_ns = {said.data["step_id"]: said.time_ns for said in evidence.events if said.kind == "capture_restarted"}
     taken = Counter(
         step_id
         for time_ns, step_id, _ in evidence.metas
         if time_ns in times_ns and time_ns >= begun_ns.get(step_id, time_ns)
     )
-    is_lossy = any(said.kind == "camera_lost" for said in evidence.said) or any(
+    is_lossy = any(said.kind == "camera_lost" for said in evidence.events) or any(
         fault.name.startswith("camera") for fault in evidence.case.faults
     )
     for mark in evidence.marks:
@@ -342,7 +342,7 @@ def readings_are_true(evidence: Evidence) -> Iterator[str]:
 @invariant(Leg.BOTH)
 def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
     """A temperature that HTTP showed is in the recording, but for the last ones before a kill."""
-    if not evidence.is_complete or any("lost" in said.kind or "dropped" in said.kind for said in evidence.said):
+    if not evidence.is_complete or any("lost" in said.kind or "dropped" in said.kind for said in evidence.events):
         return
     recorded = {name: sorted((row[0], row[1]) for row in rows) for name, rows in evidence.temperatures.items()}
     for row in (row for doors in evidence.doors for row in doors):
@@ -380,13 +380,13 @@ def verify_finds_what_is_lost_and_nothing_else(evidence: Evidence) -> Iterator[s
     if not evidence.is_complete:
         return
     program = [sys.executable, "-m", "thermostand.stand.cli", "session", "verify", "--json", str(evidence.session)]
-    ended = forked.run(program, cwd=ROOT, capture_output=True, text=True)
+    ended = fork_server.run(program, cwd=ROOT, capture_output=True, text=True)
     try:
         found = json.loads(ended.stdout)
     except ValueError:
         yield f"verify ended with {ended.returncode}: {ended.stderr[-300:]}"
         return
-    lost = any("lost" in said.kind or "dropped" in said.kind for said in evidence.said)
+    lost = any("lost" in said.kind or "dropped" in said.kind for said in evidence.events)
     if not found["sound"] and not lost:
         yield f"verify finds {found['findings'][:2]}"
     if found["frames"] != len(evidence.frames):
@@ -441,7 +441,7 @@ def _without_numbers(text: str) -> str:
 def nobody_is_pestered(evidence: Evidence) -> Iterator[str]:
     """No warning or error more than six times an hour."""
     times: dict[tuple[str, str], set[int]] = {}  # what is said while a run begins is in two records
-    for said in evidence.said:
+    for said in evidence.events:
         if said.level != "info":
             times.setdefault((said.kind, _without_numbers(said.text)), set()).add(said.time_ns)
     for (kind, text), instants in times.items():

@@ -20,11 +20,11 @@ from tests.torture.case import Case, Fault, read_case
 from thermostand.drivers.sim.control import serve_control
 from thermostand.drivers.sim.laboratory import Laboratory, LaboratorySpec
 from thermostand.drivers.sim.laboratory_faults import FaultSchedule, PlannedFault
-from thermostand.drivers.sim.physics.optics import Optics, true_centres_px
-from thermostand.foundation.clock import seconds_ns
+from thermostand.drivers.sim.physics.optics import Optics, compute_true_centres_px
+from thermostand.foundation.clock import to_ns
 from thermostand.foundation.documents import parse_document
-from thermostand.foundation.ending import Ending
 from thermostand.foundation.errors import ConfigError
+from thermostand.foundation.stop_signal import StopSignal
 
 FOLDER, LIFE = "TORTURE_FOLDER", "TORTURE_LIFE"
 AFTER_S = 90.0
@@ -54,7 +54,7 @@ class ObservedLaboratory(Laboratory):
     def after(self) -> None:
         """Time goes on without the program."""
         if self.is_virtual:
-            self.advance(self.now_ns + seconds_ns(AFTER_S))
+            self.advance(self.now_ns + to_ns(AFTER_S))
 
     def close(self) -> None:
         super().close()
@@ -69,7 +69,7 @@ class ObservedLaboratory(Laboratory):
 
     def _noted(self, time_ns: int, optics: Optics) -> Optics:
         """What a camera sees, with where the target's centres truly are in its image."""
-        self._centres.write(CENTRES.pack(time_ns, *true_centres_px(optics).flat))
+        self._centres.write(CENTRES.pack(time_ns, *compute_true_centres_px(optics).flat))
         return optics
 
     def listen(self, name, address, make_engine) -> None:
@@ -95,7 +95,7 @@ class Breaking(FaultSchedule):
             super()._set(name, value)
 
 
-def planned(case: Case, now_ns: int, folder: Path, life: int) -> list[PlannedFault]:
+def list_planned_faults(case: Case, now_ns: int, folder: Path, life: int) -> list[PlannedFault]:
     """What is still to come of the case's faults, or stands, seen from now. An operator who has resumed in vain mends
     what he was told, of what stood until then; in the end everything. In real time they are broken over the control
     socket."""
@@ -121,13 +121,13 @@ def is_named(fault: Fault, told: str) -> bool:
 
 
 def main() -> int:
-    ending, parent = Ending((signal.SIGTERM, signal.SIGINT)), os.getppid()
+    ending, parent = StopSignal((signal.SIGTERM, signal.SIGINT)), os.getppid()
     folder = Path(os.environ[FOLDER])
     spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
     life, case = int(os.environ[LIFE]), read_case(folder / "case.yaml")
     (begun := folder / f"begun-{life}").touch()
     laboratory = ObservedLaboratory(spec, folder, life)
-    schedule = Breaking(laboratory, planned(case, laboratory.now_ns, folder, life))
+    schedule = Breaking(laboratory, list_planned_faults(case, laboratory.now_ns, folder, life))
     control = serve_control(laboratory, schedule, ending.ask)
     print(json.dumps({**laboratory.addresses, "control": control.address}), flush=True)  # noqa: T201 - as drivers.sim
     while not ending.wait(0.1) and os.getppid() == parent:

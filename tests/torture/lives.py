@@ -12,7 +12,7 @@ from pathlib import Path
 
 import yaml
 
-from tests import forked
+from tests import fork_server
 from tests.torture.case import Case, stand_document, write_case
 
 ROOT = Path(__file__).parents[2]
@@ -74,8 +74,8 @@ def find_folder(folder: Path) -> bool:
 
 def _life(folder: Path, number: int, command: list[str]) -> Life:
     program = [sys.executable, "-m", "tests.torture.product", str(folder), str(number), *command]
-    process = forked.popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    status, out, err = _ended(process, folder / f"truth-{number}.bin")
+    process = fork_server.popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    status, out, err = _wait_for_end(process, folder / f"truth-{number}.bin")
     (folder / f"said-{number}.txt").write_text(out + err)
     for _ in range(round(_LABORATORY_S / _LOOK_S)):
         if not (folder / f"begun-{number}").exists():
@@ -84,7 +84,7 @@ def _life(folder: Path, number: int, command: list[str]) -> Life:
     return Life(command, status, out, err)
 
 
-def _ended(process: subprocess.Popen[str], truth: Path) -> tuple[int | None, str, str]:
+def _wait_for_end(process: subprocess.Popen[str], truth: Path) -> tuple[int | None, str, str]:
     """Its status, None for one that hung, and what it said."""
     size = -1
     for _ in range(MOST_LOOKS):

@@ -203,7 +203,7 @@ def table() -> dict[str, Any]:
     return yaml.safe_load(TABLE.read_text(encoding="utf-8"))
 
 
-def drawn(files: list[str], count: int, seed: int) -> list[Mutant]:
+def draw_mutants(files: list[str], count: int, seed: int) -> list[Mutant]:
     """That many mistakes in those files, of all that could be made."""
     sources = {file: (ROOT / file).read_text(encoding="utf-8") for file in files}
     every = [(file, *place) for file, source in sources.items() for place in places(source)]
@@ -225,7 +225,7 @@ def _processor_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _looked(made: Mutant, stages: list[str]) -> str:
+def _find_killer(made: Mutant, stages: list[str]) -> str:
     return _here[0].with_mistake(made, stages)
 
 
@@ -241,7 +241,7 @@ def main() -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     begun_s, how = time.monotonic(), Counter[str]()
     none = {(each["file"], each["was"], each["now"]) for each in known["equivalent"]}
-    every = drawn(given.of, given.count, given.seed)
+    every = draw_mutants(given.of, given.count, given.seed)
     made = [each for each in every if (each.file, each.was, each.now) not in none]
     stages = {file: [*known["tests"][file], TORTURE] for file in given.of}
     context = multiprocessing.get_context("spawn")
@@ -252,7 +252,7 @@ def main() -> int:
         tempfile.TemporaryDirectory(prefix="mutants-") as folder,
         ProcessPoolExecutor(given.jobs, context, _begin, (Path(folder), numbers)) as pool,
     ):
-        looks = [pool.submit(_looked, each, stages[each.file]) for each in made]
+        looks = [pool.submit(_find_killer, each, stages[each.file]) for each in made]
         for count, (each, look) in enumerate(zip(made, looks, strict=True), 1):
             found = look.result()
             how[_kind(found)] += 1

@@ -22,12 +22,12 @@ from pathlib import Path
 
 import thermostand.stand.service.run as run_module
 from tests.torture.case import Case, Order, read_case
-from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE
 from tests.torture.lives import HIDDEN, find_folder
-from thermostand.foundation.clock import NS_PER_S, VirtualClock, seconds_ns
+from tests.torture.operator_actions import OperatorActions
+from thermostand.foundation.clock import NS_PER_S, VirtualClock, to_ns
 from thermostand.recording.writing import notices
-from thermostand.stand.serving.client import Server, server_of
+from thermostand.stand.serving.client import Server, find_session_server
 from thermostand.stand.simulator import Simulator
 
 LOOK_EVERY_S, LOOKS = 300.0, 200  # at what HTTP says
@@ -35,7 +35,7 @@ _TASKS = ("TaskStepMethWrapper", "TaskWakeupMethWrapper", "builtin_function_or_m
 _SIGNALS = {"stop": signal.SIGTERM, "interrupt": signal.SIGINT}
 
 
-class DrawnLoop(asyncio.SelectorEventLoop):
+class ShuffledLoop(asyncio.SelectorEventLoop):
     """Tasks that are ready at one turn run in a drawn order; all other callbacks stay where they are. What is drawn
     depends on the instant alone, so that turns of the loop that a busy machine adds change nothing later."""
 
@@ -68,7 +68,7 @@ class TortureClock(VirtualClock):
         if schedule.case.drawn_order:
             drawn = random.Random(f"{schedule.case.seed} {start_ns}")
             self._order = iter(lambda: drawn.getrandbits(62), -1)
-        if isinstance(loop, DrawnLoop):
+        if isinstance(loop, ShuffledLoop):
             loop.clock = self
 
     async def run(self) -> None:
@@ -83,7 +83,7 @@ class Disk:
     is_full = refuses = False
 
     def __init__(self) -> None:
-        synced, space = os.fdatasync, notices.disk_space
+        synced, space = os.fdatasync, notices.read_disk_space
 
         def sync(file: int) -> None:
             if self.refuses:
@@ -91,7 +91,7 @@ class Disk:
             synced(file)
 
         os.fdatasync = sync
-        notices.disk_space = lambda folder: space(folder)._replace(**({"free_bytes": 0} if self.is_full else {}))
+        notices.read_disk_space = lambda folder: space(folder)._replace(**({"free_bytes": 0} if self.is_full else {}))
 
 
 class Schedule:
@@ -100,7 +100,7 @@ class Schedule:
     def __init__(self, case: Case, folder: Path, life: int) -> None:
         self.case, self._folder, self.disk = case, folder, Disk()
         bus = partial(os.environ.get, "TORTURE_BUS", "")
-        self.doors = Doors(case, folder / f"doors-{life}.jsonl", self._server, bus, self._name)
+        self.doors = OperatorActions(case, folder / f"doors-{life}.jsonl", self._server, bus, self._name)
         before = folder / f"doors-{life - 1}.jsonl"
         rows = before.read_text().splitlines() if before.exists() else []
         # A life may begin before the last one's end: its orders are not given twice.
@@ -112,7 +112,7 @@ class Schedule:
         looks = [Order("state", begin_s + LOOK_EVERY_S * (number + 1)) for number in range(LOOKS)]
         for order in sorted((*self.case.orders, *kills, *looks), key=lambda order: order.at_s):
             if order.at_s > begin_s:
-                await clock.sleep_until(self.case.start_ns + seconds_ns(order.at_s))
+                await clock.sleep_until(self.case.start_ns + to_ns(order.at_s))
                 with clock.hold():
                     await asyncio.to_thread(self._do, order, clock.now_ns())
 
@@ -138,7 +138,7 @@ class Schedule:
         return session.name if session else ""
 
     def _server(self) -> Server:
-        return server_of(self._session() or self._folder)
+        return find_session_server(self._session() or self._folder)
 
     def _change_disk(self, verb: str, session: Path | None) -> bool:
         """Whether it could be done."""
@@ -176,8 +176,8 @@ def main() -> None:
     Simulator.__init__ = begun
     run_module.VirtualClock = lambda start_ns, advance: TortureClock(schedule, start_ns, advance)
     if case.drawn_order:
-        DrawnLoop.seed = case.seed
-        asyncio.events.new_event_loop = asyncio.runners.events.new_event_loop = DrawnLoop
+        ShuffledLoop.seed = case.seed
+        asyncio.events.new_event_loop = asyncio.runners.events.new_event_loop = ShuffledLoop
     sys.argv = ["stand", *command]
     from thermostand.stand.cli import app
 

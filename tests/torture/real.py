@@ -31,8 +31,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tests import forked
-from tests.addresses import WORKER, camera_address, free_port, move_to_free
+from tests import fork_server
+from tests.addresses import WORKER, allocate_camera_address, find_free_port, move_to_free
 from tests.recording.disks import ext4
 from tests.sections import change
 from tests.stand.floods import FLOODS
@@ -48,17 +48,17 @@ from tests.torture.case import (
     stand_document,
     write_case,
 )
-from tests.torture.doors import Doors
 from tests.torture.laboratory import FOLDER, LIFE
 from tests.torture.lives import HIDDEN, ROOT, Life, find_folder
+from tests.torture.operator_actions import OperatorActions
 from thermostand.drivers.sim.laboratory_faults import FAULTS
-from thermostand.foundation.addresses import tcp_place
-from thermostand.foundation.clock import NS_PER_S, WallClock, seconds_ns
+from thermostand.foundation.addresses import parse_tcp_address
+from thermostand.foundation.clock import NS_PER_S, WallClock, to_ns
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.writing.disk import MODULE
 from thermostand.stand.config.stand_config import load_config
-from thermostand.stand.serving.client import Server, server_of
-from thermostand.stand.simulator import laboratory_of
+from thermostand.stand.serving.client import Server, find_session_server
+from thermostand.stand.simulator import describe_laboratory
 
 BUSY_S = 40.0  # in which things break
 AFTER_S = 7.0
@@ -205,7 +205,7 @@ def folder_lost(bench: Bench, order: Order) -> Iterator[None]:
 
 @kind()
 def clock_stepped(bench: Bench, order: Order) -> Iterator[None]:
-    bench.step_ns += seconds_ns(bench.drawn(order, (5.0, -5.0, 3600.0, -3600.0)))
+    bench.step_ns += to_ns(bench.drawn(order, (5.0, -5.0, 3600.0, -3600.0)))
     bench.write_clocks()
     yield
 
@@ -263,7 +263,7 @@ def draw_real(seed: int) -> Case:
     stand = draw_stand(drawn)
     left = {name for name in (*FAULTS, *KINDS, "kill") if drawn.random() >= LEFT_OUT}
     verbs = [name for name in KINDS if name in left and (MOUNTS or name not in ("disk_hangs", "disk_is_full"))]
-    orders = [_drawn_order(drawn, verb) for verb in drawn.choices(verbs, k=drawn.randint(1, MOST_ORDERS))]
+    orders = [_draw_order(drawn, verb) for verb in drawn.choices(verbs, k=drawn.randint(1, MOST_ORDERS))]
     kills = drawn.randint(0, MOST_KILLS) if "kill" in left else 0
     return Case(
         seed,
@@ -278,7 +278,7 @@ def draw_real(seed: int) -> Case:
     )
 
 
-def _drawn_order(drawn: random.Random, verb: str) -> Order:
+def _draw_order(drawn: random.Random, verb: str) -> Order:
     body = {"for_s": drawn.choice(KINDS[verb].lasts_s), "draw": round(drawn.random(), 3)}
     return Order(verb, round(drawn.uniform(1.0, BUSY_S), 1), body)
 
@@ -302,7 +302,7 @@ def real_document(case: Case, folder: Path) -> dict[str, Any]:
     if data.get("regulator", {}).get("kind") == "software":
         data["regulator"] |= PULSES
     for camera in data["cameras"].values():
-        camera |= {**CAMERA, "address": camera_address()}
+        camera |= {**CAMERA, "address": allocate_camera_address()}
     data["compressor"] = BRIEF
     data["guard"].setdefault("overrides", []).extend(f"compressor.{name}" for name in BRIEF)
     return data
@@ -316,7 +316,7 @@ class Bench:
         self.clock = WallClock()
         self.case = case
         self.disk, self._folder = disk, folder
-        self.port, self.secop = free_port(), free_port()
+        self.port, self.secop = find_free_port(), find_free_port()
         self.step_ns = self._offset_ns = self._laboratories = self._daemons = 0
         self._over, self._late_s, self._opened_ns, self._clears_s = threading.Event(), 0.0, 0, 0.0
         self._is_done = self._is_quiet = False
@@ -326,13 +326,15 @@ class Bench:
         (folder / "case.yaml").write_text(write_case(case))
         stand = real_document(case, folder)
         (folder / "stand.yaml").write_text(yaml.safe_dump(stand))
-        self._spec = laboratory_of(load_config(folder / "stand.yaml"), virtual=False, seed=None)
-        self._control = tcp_place(stand["simulation"]["control"])
-        self.doors = Doors(case, folder / "doors-0.jsonl", self._server, lambda: stand["bus"]["address"], self.session)
+        self._spec = describe_laboratory(load_config(folder / "stand.yaml"), virtual=False, seed=None)
+        self._control = parse_tcp_address(stand["simulation"]["control"])
+        self.doors = OperatorActions(
+            case, folder / "doors-0.jsonl", self._server, lambda: stand["bus"]["address"], self.session
+        )
         for name in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
             (place := folder / name).mkdir(mode=0o700)
             os.environ[name] = str(place)
-        self._env = {**os.environ, FOLDER: str(folder), forked.OWN_HELPERS: "1", "OPENBLAS_NUM_THREADS": "1"}
+        self._env = {**os.environ, FOLDER: str(folder), fork_server.OWN_HELPERS: "1", "OPENBLAS_NUM_THREADS": "1"}
         if any(order.verb == "clock_stepped" for order in case.orders):
             self._env |= {"THERMOSTAND_MOVED_CLOCKS": str(folder / "clocks"), "PYTHONPATH": str(MOVED)}
             self.write_clocks()
@@ -415,7 +417,7 @@ class Bench:
         self._laboratories += 1
         program = [sys.executable, "-m", "tests.torture.laboratory"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        self.laboratory = forked.popen(program, cwd=ROOT, env=env, text=True, start_new_session=True, **pipes)
+        self.laboratory = fork_server.popen(program, cwd=ROOT, env=env, text=True, start_new_session=True, **pipes)
         if self.laboratory.stdin is None or self.laboratory.stdout is None:
             raise ValueError("the laboratory was started without its pipes")
         self.laboratory.stdin.write(json.dumps(self._spec))
@@ -436,7 +438,7 @@ class Bench:
             self.doors.note(replace(order, verb="stop_pressed", body=body), self.now_ns(), is_answered)
 
     def _server(self) -> Server:
-        return server_of(self.disk / "out")
+        return find_session_server(self.disk / "out")
 
     def _break(self, order: Order | Fault) -> None:
         at_s = order.at_s - (self.clock.now_ns() - self.case.start_ns) / NS_PER_S

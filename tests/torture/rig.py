@@ -44,31 +44,31 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
     place = folder or Path(tempfile.mkdtemp(prefix="torture-"))
     try:
         begun, lives = live_real(case, place) if case.is_real else (case, live(case, place))
-        left = _digests(place)  # before the evidence, for which what is unfinished is salvaged
+        left = _compute_digests(place)  # before the evidence, for which what is unfinished is salvaged
         evidence = (RealEvidence if case.is_real else Evidence)(begun, place, lives)
         spans_ns = [int(each["time_ns"][-1] - each["time_ns"][0]) for each in evidence.truth if len(each)]
-        events = Counter(said.kind for said in evidence.said)
-        trips = [said for said in evidence.said if said.kind.startswith("guard.") and "rule" in said.data]
+        events = Counter(said.kind for said in evidence.events)
+        trips = [said for said in evidence.events if said.kind.startswith("guard.") and "rule" in said.data]
         rules = Counter(str(said.data["rule"]) for said in trips)
         steps = {mark.step_id: mark.kind for mark in evidence.marks}
         found = tuple(violations(evidence))
         if twice and not case.kills_s and all(life.status is not None for life in evidence.lives):
-            found += tuple(_differing(case, place, left))
+            found += tuple(_find_differences(case, place, left))
         return Result(case, tuple(evidence.lives), found, sum(spans_ns) / 1e9, events, rules, evidence.journal, steps)
     finally:
         if folder is None:
             shutil.rmtree(place, ignore_errors=True)
 
 
-def _differing(case: Case, folder: Path, first: dict[str, str]) -> Iterator[Violation]:
+def _find_differences(case: Case, folder: Path, first: dict[str, str]) -> Iterator[Violation]:
     live(case, folder)
-    second = _digests(folder)
+    second = _compute_digests(folder)
     differing = sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
     if differing:
         yield Violation("is_the_same_twice", f"not the same twice: {', '.join(differing[:6])}", len(differing))
 
 
-def _digests(folder: Path) -> dict[str, str]:
+def _compute_digests(folder: Path) -> dict[str, str]:
     """Of the session's files."""
     files = [path for path in folder.glob("out/*/**/*") if path.is_file()]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
@@ -79,7 +79,7 @@ def perform_seed(seed: int, *, is_real: bool = False) -> Result:
     return perform(draw_real(seed)) if is_real else perform(draw(seed), twice=seed % 8 == 0)
 
 
-def shrunk(case: Case, rules: set[str], tries: int) -> Case:
+def shrink(case: Case, rules: set[str], tries: int) -> Case:
     """The smallest found that still breaks one of the rules; each try is a run. What did not break it is tried again
     only when everything else was tried: most of what a case needs it goes on to need."""
     needed, again = set[str](), False
@@ -100,7 +100,7 @@ def shrunk(case: Case, rules: set[str], tries: int) -> Case:
     return case
 
 
-def told(result: Result) -> Iterator[str]:
+def format_result(result: Result) -> Iterator[str]:
     """A line for a case, and one for each violation."""
     case, hours = result.case, result.simulated_s / 3600.0
     ends = " ".join("hung" if life.status is None else str(life.status) for life in result.lives)

@@ -17,11 +17,11 @@ import pytest
 
 from tests.system.conftest import require_aravis
 from tests.torture.case import MOST_FAULTS, PLAIN, Case, Fault, Order, draw, read_case, steps_of, write_case
-from tests.torture.evidence import Evidence, Said
+from tests.torture.evidence import Evidence, RecordedEvent
 from tests.torture.invariants import INVARIANTS, RELAYS_UNIT, violations
 from tests.torture.lives import live
 from tests.torture.real import draw_real
-from tests.torture.rig import shrunk
+from tests.torture.rig import shrink
 
 
 def at(degC: float, role: str) -> list[Any]:
@@ -82,8 +82,8 @@ def no_more(evidence: Evidence, is_of_it: Callable[[int], bool]) -> None:
 
 def hold(evidence: Evidence) -> None:
     begin = middle_ns(evidence)
-    evidence.said.append(Said(begin, "warning", "held", "", {"reason": "interlock"}))
-    evidence.said.append(Said(begin + int(200e9), "info", "released", "", {"reason": "interlock"}))
+    evidence.events.append(RecordedEvent(begin, "warning", "held", "", {"reason": "interlock"}))
+    evidence.events.append(RecordedEvent(begin + int(200e9), "info", "released", "", {"reason": "interlock"}))
     changed(evidence, "heater_enabled", 1.0)
 
 
@@ -108,7 +108,7 @@ def fail_thrice(evidence: Evidence) -> None:
 
 
 def pester(evidence: Evidence) -> None:
-    evidence.said += [Said(number, "warning", "some", f"{number} K", {}) for number in range(8)]
+    evidence.events += [RecordedEvent(number, "warning", "some", f"{number} K", {}) for number in range(8)]
 
 
 def switch_compressor(evidence: Evidence) -> None:
@@ -131,7 +131,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "air_is_never_too_warm": lambda evidence: changed(evidence, "bulk_air_degC", 69.0, 0.5, 0.6),
     "heat_needs_a_permission_of_the_last_15_s": lambda evidence: no_more(evidence, lambda unit: unit == RELAYS_UNIT),
     "heat_needs_fresh_readings": lambda evidence: no_more(evidence, lambda unit: unit != RELAYS_UNIT),
-    "nothing_heats_unrecorded": lambda evidence: evidence.said.clear(),
+    "nothing_heats_unrecorded": lambda evidence: evidence.events.clear(),
     "compressor_rests": switch_compressor,
     "flap_is_open_for_captures_only": lambda evidence: changed(evidence, "flap_open", 1.0),
     "holds_are_safe": hold,
@@ -151,7 +151,7 @@ FORBIDDEN: dict[str, Callable[[Evidence], object]] = {
     "a_fit_holds_the_truth": blow_up,
     "heat_ends_with_the_program": stop_program,
     "a_stop_is_answered": press_stop,
-    "nothing_is_left": lambda evidence: end(evidence, left=("python -m thermostand.foundation.helper",)),
+    "nothing_is_left": lambda evidence: end(evidence, left=("python -m thermostand.foundation.worker_process",)),
 }
 """For each invariant what is changed in the evidence, so that it must be found."""
 
@@ -209,11 +209,11 @@ def test_a_broken_case_is_shrunk_to_what_breaks_it(
     case = replace(case, stand={**case.stand, "cameras": "2 cameras", "heat": "cts"})
     monkeypatch.setattr(rig, "perform", lambda case: rig.Result(case, (), (), 0.0, Counter(), Counter(), [], {}))
     monkeypatch.setattr(rig.Result, "broken", property(lambda self: is_broken(self.case)))
-    least = shrunk(case, {"x"}, tries)
+    least = shrink(case, {"x"}, tries)
     assert {fault.name for fault in least.faults} == {name for name in names if name in needed}
     assert [order.verb for order in least.orders] == [name for name in needed if name == "pause"]
     assert least.kills_s == tuple(each for each in needed if isinstance(each, float))
-    done = shrunk(least, {"x"}, 1000)
+    done = shrink(least, {"x"}, 1000)
     assert done.stand == PLAIN | {"cameras": "2 cameras"}
     assert (done.attended, done.drawn_order, steps_of(done.plan)) == (False, False, 2)
     assert all(fault.for_s <= 20.0 for fault in done.faults)

@@ -31,9 +31,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 
-from thermostand.compensation.finding.workers import pool
+from thermostand.compensation.finding.workers import open_pool
 from thermostand.compensation.observations import Float, Observations
-from thermostand.compensation.reporting.tracks import thinned
+from thermostand.compensation.reporting.tracks import thin
 
 I_COLOUR, J_COLOUR = "#0072B2", "#D55E00"
 CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"
@@ -71,15 +71,15 @@ _GREY_STEP = 8
 """A coarser picture has no noise to store."""
 
 
-def style() -> AbstractContextManager[None]:
+def apply_style() -> AbstractContextManager[None]:
     """The look of all figures."""
     return mpl.rc_context(_STYLE)  # pyright: ignore[reportArgumentType] - the keys are checked at run time
 
 
-def as_svg(figure: Figure, name: str) -> str:
+def render_svg(figure: Figure, name: str) -> str:
     """The figure as an <svg> element for a page; every id begins with `name`, so that several fit in one page."""
     text = io.StringIO()
-    with style():
+    with apply_style():
         figure.savefig(text, format="svg", dpi=_RASTER_DPI, metadata=_NO_METADATA)
     svg = re.sub(
         r' id="image[0-9a-f]+"', "", text.getvalue()
@@ -88,7 +88,7 @@ def as_svg(figure: Figure, name: str) -> str:
     return svg[svg.index("<svg") :]
 
 
-def new_figure(
+def create_figure(
     width_in: float, height_in: float, rows: int, columns: int, *, share: bool = True
 ) -> tuple[Figure, list[Axes]]:
     """A figure of panels; with `share` those in a column share their x, those in a row their y axis."""
@@ -103,7 +103,7 @@ def new_figure(
     return figure, panels
 
 
-def legend_above(axes: Axes, columns: int = 3) -> None:
+def add_legend_above(axes: Axes, columns: int = 3) -> None:
     """A legend over the axes, where no data are."""
     shown = axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.2, handlelength=1.6)
     for handle in shown.legend_handles:
@@ -126,13 +126,13 @@ class Panel:
     look: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
-def panels(
+def draw_panels(
     columns: int, height_in: float, shown: Sequence[Panel], *, share: bool = True, one_legend: bool = False
 ) -> Figure:
     """Panels in rows. share: those in a column have one x axis, those in a row one y axis, labelled at the outer ones
     only. one_legend: that of the first panel, for all."""
-    with style():
-        figure, places = new_figure(FULL_WIDTH_IN, height_in, -(-len(shown) // columns), columns, share=share)
+    with apply_style():
+        figure, places = create_figure(FULL_WIDTH_IN, height_in, -(-len(shown) // columns), columns, share=share)
         for axes, panel in zip(places, shown, strict=True):
             for mark in panel.marks:
                 mark(axes)
@@ -143,14 +143,14 @@ def panels(
             if share:
                 axes.label_outer()
             if panel.legend and not one_legend:
-                legend_above(axes, panel.legend)
+                add_legend_above(axes, panel.legend)
         if one_legend:
             handles, labels = places[0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside upper left", ncols=4, handlelength=1.6)
     return figure
 
 
-def curve(
+def make_curve(
     x: ArrayLike, y: ArrayLike, colour: str, label: str | None = None, *, error: ArrayLike | None = None, **look: Any
 ) -> Mark:
     """Points (M,) and what joins them; error (M,): half of each one's bar along y. look: as matplotlib's lines have
@@ -161,49 +161,51 @@ def curve(
     return lambda axes: axes.errorbar(x, y, error, **usual | look)
 
 
-def dots(x: ArrayLike, y: ArrayLike, colour: str, label: str) -> Mark:
+def make_dots(x: ArrayLike, y: ArrayLike, colour: str, label: str) -> Mark:
     """Many single points, as a picture: the page does not grow with their number."""
     small = {"marker": "o", "linestyle": "", "markersize": 2, "markeredgewidth": 0}
-    return curve(x, y, colour, label, alpha=0.5, rasterized=True, **small)
+    return make_curve(x, y, colour, label, alpha=0.5, rasterized=True, **small)
 
 
-def rule(at: float, label: str | None = None, *, upright: bool = False, colour: str = GREY, style: str = "--") -> Mark:
+def make_rule(
+    at: float, label: str | None = None, *, upright: bool = False, colour: str = GREY, style: str = "--"
+) -> Mark:
     """A line through the whole panel."""
     look: dict[str, Any] = {"color": colour, "linewidth": 0.8, "linestyle": style, "label": label}
     return lambda axes: axes.axvline(at, **look) if upright else axes.axhline(at, **look)
 
 
-def span(begin: float, end: float, colour: str, label: str | None) -> Mark:
+def make_span(begin: float, end: float, colour: str, label: str | None) -> Mark:
     """A band behind the panel from left to right of it."""
     return lambda axes: axes.axvspan(begin, end, color=colour, alpha=0.25, linewidth=0, label=label)
 
 
-def band(x: Float, reach: Float, label: str) -> Mark:
+def make_band(x: Float, reach: Float, label: str) -> Mark:
     """From -reach to reach (M,) about 0."""
     return lambda axes: axes.fill_between(x, -reach, reach, color="#dddddd", linewidth=0, label=label)
 
 
-def histogram(values: Float, bins: Any, colour: str, label: str, **look: Any) -> Mark:
+def make_histogram(values: Float, bins: Any, colour: str, label: str, **look: Any) -> Mark:
     """How often values (M,) occur."""
     return lambda axes: axes.hist(values, bins, color=colour, label=label, **look)
 
 
-def bars(places: ArrayLike, height: Float, error: Float, colour: str, label: str) -> Mark:
+def make_bars(places: ArrayLike, height: Float, error: Float, colour: str, label: str) -> Mark:
     """Upright bars (M,) with their uncertainties."""
     return lambda axes: axes.bar(places, height, 0.4, yerr=error, color=colour, error_kw={"lw": 0.8}, label=label)
 
 
-def words(x: float, y: float, text: str, colour: str) -> Mark:
+def make_text(x: float, y: float, text: str, colour: str) -> Mark:
     """Written at a place."""
     return lambda axes: axes.text(x, y, text, color=colour, ha="center", va="center", fontweight="bold")
 
 
-def rising_colours() -> Colormap:
+def make_sequential_colormap() -> Colormap:
     """Of values from low to high: plasma without its yellow, which does not show on white."""
     return ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.88, 256)))
 
 
-def image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
+def set_image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
     """Those of an image (width, height), px."""
     width, height = image_size
     axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
@@ -211,26 +213,26 @@ def image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
     axes.grid(visible=False)
 
 
-def arrows(
+def draw_arrows(
     at_px: Float, moved_px: Float, image_size: tuple[int, int], values: Float | None = None, label: str = ""
 ) -> Figure:
     """Motions (M, 2) of places (M, 2) over the image, enlarged until the larger ones show; a bar says how much. values
     (M,): their colours, which a scale with the label explains."""
-    scale, bar_px = enlarged(float(np.quantile(np.linalg.norm(moved_px, axis=1), 0.95)), image_size[0])
-    with style():
-        figure, (axes,) = new_figure(FULL_WIDTH_IN, 5.4, 1, 1)
-        look: dict[str, Any] = {"color": I_COLOUR} if values is None else {"cmap": rising_colours()}
+    scale, bar_px = choose_enlargement(float(np.quantile(np.linalg.norm(moved_px, axis=1), 0.95)), image_size[0])
+    with apply_style():
+        figure, (axes,) = create_figure(FULL_WIDTH_IN, 5.4, 1, 1)
+        look: dict[str, Any] = {"color": I_COLOUR} if values is None else {"cmap": make_sequential_colormap()}
         look |= {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0016, "rasterized": True}
         drawn = axes.quiver(*at_px.T, *(scale * moved_px).T, *(() if values is None else (values,)), **look)
-        image_axes(axes, image_size)
+        set_image_axes(axes, image_size)
         axes.set_facecolor(PALE)
-        _bar(axes, image_size, scale * bar_px, f"{1e3 * bar_px:g} mpx, {scale:,.0f} times")
+        _draw_scale_bar(axes, image_size, scale * bar_px, f"{1e3 * bar_px:g} mpx, {scale:,.0f} times")
         if values is not None:
             figure.colorbar(drawn, ax=axes, label=label, shrink=0.85, pad=0.02)
     return figure
 
 
-def _bar(axes: Axes, image_size: tuple[int, int], length_px: float, text: str) -> None:
+def _draw_scale_bar(axes: Axes, image_size: tuple[int, int], length_px: float, text: str) -> None:
     """At the lower left of an image, what a motion looks like that is drawn so long."""
     width, height = image_size
     x, y = 0.03 * width, 0.965 * height
@@ -238,7 +240,7 @@ def _bar(axes: Axes, image_size: tuple[int, int], length_px: float, text: str) -
     axes.text(x + length_px + 0.01 * width, y, text, va="center", fontsize=8, color=ON_PALE, bbox=_BOX)
 
 
-def enlarged(long_px: float, width: int) -> tuple[float, float]:
+def choose_enlargement(long_px: float, width: int) -> tuple[float, float]:
     """By how much an arrow of this length is drawn longer, a round number, and a round length for the bar beside it."""
     wanted = _LONGEST_ARROW * width / max(long_px, 1e-9)
     power = 10 ** math.floor(math.log10(wanted))
@@ -247,7 +249,7 @@ def enlarged(long_px: float, width: int) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paths:
+class PathPanel:
     """One panel of paths: start_px (N, 2), moved_px (F, N, 2) from there, camera_degC (F,)."""
 
     title: str
@@ -256,7 +258,7 @@ class Paths:
     camera_degC: Float
 
 
-def trajectories(observations: Observations, shown: Sequence[Paths]) -> Figure:
+def draw_trajectories(observations: Observations, shown: Sequence[PathPanel]) -> Figure:
     """Each marker's path x100, two panels in a row, coloured by the camera's temperature.
 
     The ground is the first frame, or the outlines of the discs where the camera stood differently.
@@ -265,26 +267,26 @@ def trajectories(observations: Observations, shown: Sequence[Paths]) -> Figure:
     rows = -(-len(shown) // columns)
     known = np.concatenate([panel.camera_degC for panel in shown])
     norm = Normalize(float(np.nanmin(known)), float(np.nanmax(known)))
-    with style():
-        figure, places = new_figure(FULL_WIDTH_IN, (5.5 if columns == 1 else 3.3) * rows, rows, columns)
+    with apply_style():
+        figure, places = create_figure(FULL_WIDTH_IN, (5.5 if columns == 1 else 3.3) * rows, rows, columns)
         for panel, axes in zip(shown, places, strict=False):
-            _ground(axes, observations, panel.start_px)
+            _draw_background(axes, observations, panel.start_px)
             axes.set_title(panel.title, fontsize=9, loc="left")
-            drawn = thinned(len(panel.moved_px), _PATH_POINTS)
+            drawn = thin(len(panel.moved_px), _PATH_POINTS)
             path = panel.start_px + EXAGGERATION * panel.moved_px[drawn]
             colour = np.broadcast_to(panel.camera_degC[drawn][:, None], path.shape[:2])
             good = np.isfinite(path).all(axis=2)
-            look: dict[str, Any] = {"s": 5, "cmap": rising_colours(), "norm": norm, "linewidths": 0}
+            look: dict[str, Any] = {"s": 5, "cmap": make_sequential_colormap(), "norm": norm, "linewidths": 0}
             axes.scatter(*path[good].T, c=colour[good], rasterized=True, **look)
             axes.label_outer()
         for spare in places[len(shown) :]:
             spare.remove()
-        scale = ScalarMappable(norm, rising_colours())
+        scale = ScalarMappable(norm, make_sequential_colormap())
         figure.colorbar(scale, ax=places[: len(shown)], label="camera temperature (°C)", shrink=0.85, pad=0.02)
     return figure
 
 
-def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
+def _draw_background(axes: Axes, observations: Observations, start_px: Float) -> None:
     width, height = observations.image_size
     first = observations.centres_px[int(np.argmax(observations.usable))]
     away_px = np.linalg.norm(first - start_px, axis=1)
@@ -298,12 +300,12 @@ def _ground(axes: Axes, observations: Observations, start_px: Float) -> None:
             interpolation="none",
         )
     else:
-        _outlines(axes, observations, start_px)
-    image_axes(axes, observations.image_size)
-    _bar(axes, observations.image_size, 0.5 * EXAGGERATION, "0.5 px of drift")
+        _draw_outlines(axes, observations, start_px)
+    set_image_axes(axes, observations.image_size)
+    _draw_scale_bar(axes, observations.image_size, 0.5 * EXAGGERATION, "0.5 px of drift")
 
 
-def _outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
+def _draw_outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
     """Discs whose size follows from the distance of their neighbours."""
     axes.set_facecolor(PALE)
     seen = np.isfinite(start_px).all(axis=1)
@@ -317,7 +319,7 @@ def _outlines(axes: Axes, observations: Observations, start_px: Float) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heights:
+class ContourPanel:
     """Values (H, W) at pixels (H, W, 2); NaN where nothing is known."""
 
     pixels: Float
@@ -325,22 +327,22 @@ class Heights:
     label: str
 
 
-def contours(shown: Sequence[Heights], image_size: tuple[int, int], seen_px: Float) -> Figure:
+def draw_contours(shown: Sequence[ContourPanel], image_size: tuple[int, int], seen_px: Float) -> Figure:
     """Values over the image side by side, hatched grey where they are not known; white dots (M, 2): seen markers."""
-    with style():
-        figure, places = new_figure(FULL_WIDTH_IN, 3.4, 1, len(shown))
+    with apply_style():
+        figure, places = create_figure(FULL_WIDTH_IN, 3.4, 1, len(shown))
         for axes, one in zip(places, shown, strict=True):
             columns, rows, known = one.pixels[..., 0], one.pixels[..., 1], np.isfinite(one.values)
             if known.any():
                 drawn = axes.contourf(columns, rows, np.ma.masked_invalid(one.values), levels=12, cmap="viridis")
                 figure.colorbar(drawn, ax=axes, label=one.label, orientation="horizontal", pad=0.02, shrink=0.9)
             axes.plot(*seen_px.T, ",", color="white", alpha=0.5, rasterized=True)
-            image_axes(axes, image_size)
+            set_image_axes(axes, image_size)
             axes.label_outer()
             if not known.all():
                 hatched: dict[str, Any] = {"facecolor": "#d9d9d9", "edgecolor": GREY, "hatch": "///", "zorder": -1}
                 axes.add_patch(Rectangle((0, 0), 1, 1, label="not seen here", transform=axes.transAxes, **hatched))
-                legend_above(axes)
+                add_legend_above(axes)
     return figure
 
 
@@ -354,49 +356,49 @@ Draw = Callable[[Sequence[Named]], list[str]]
 """Figures with the names that their ids begin with -> the SVG of each."""
 
 
-def one_by_one(figures: Sequence[Named]) -> list[str]:
+def render_in_turn(figures: Sequence[Named]) -> list[str]:
     """In this process."""
-    return [as_svg(figure, name) for figure, name in figures]
+    return [render_svg(figure, name) for figure, name in figures]
 
 
 # Figures go through files: a pool whose process is killed while a long message is in its pipe waits for ever.
 @contextmanager
-def drawing(workers: int) -> Generator[Draw]:
+def open_renderer(workers: int) -> Generator[Draw]:
     """With two or more workers one process more, which loads what it needs from now on."""
     if workers < 2:
-        yield one_by_one
+        yield render_in_turn
         return
-    with TemporaryDirectory(prefix="thermostand-drawn-") as folder, pool(1) as other:
-        other.submit(_loaded)
-        yield partial(_by_two, other, folder)
+    with TemporaryDirectory(prefix="thermostand-drawn-") as folder, open_pool(1) as other:
+        other.submit(_import_module)
+        yield partial(_render_in_two_processes, other, folder)
 
 
-def _by_two(other: ProcessPoolExecutor, folder: str, figures: Sequence[Named]) -> list[str]:
+def _render_in_two_processes(other: ProcessPoolExecutor, folder: str, figures: Sequence[Named]) -> list[str]:
     """This process from the first figure on, the other one from the last, until they meet."""
     given: dict[int, Future[str]] = {}
     with suppress(BrokenProcessPool):
         for number in range(len(figures) - 1, len(figures) // 3, -1):  # it never comes to the first third
             path = Path(folder) / str(number)
             path.write_bytes(pickle.dumps(figures[number]))
-            given[number] = other.submit(_drawn_file, str(path))
-    svgs = [as_svg(*figure) if n not in given or given[n].cancel() else "" for n, figure in enumerate(figures)]
-    return [svg or _answer(given[n], figures[n]) for n, svg in enumerate(svgs)]
+            given[number] = other.submit(_render_file, str(path))
+    svgs = [render_svg(*figure) if n not in given or given[n].cancel() else "" for n, figure in enumerate(figures)]
+    return [svg or _collect_answer(given[n], figures[n]) for n, svg in enumerate(svgs)]
 
 
-def _answer(given: Future[str], figure: Named) -> str:
+def _collect_answer(given: Future[str], figure: Named) -> str:
     try:
         return Path(given.result()).read_text(encoding="utf-8")
     except BrokenProcessPool:  # the other process was killed
-        return as_svg(*figure)
+        return render_svg(*figure)
 
 
-def _loaded() -> None:
+def _import_module() -> None:
     """This module is: to be called, it was imported."""
 
 
-def _drawn_file(path: str) -> str:
+def _render_file(path: str) -> str:
     """The path of a file with the SVG of the figure in another one. Neither goes through the pool's pipes: of a process
     that is killed in the middle of either the pool would wait for the rest for ever."""
     done = Path(f"{path}.svg")
-    done.write_text(as_svg(*pickle.loads(Path(path).read_bytes())), encoding="utf-8")
+    done.write_text(render_svg(*pickle.loads(Path(path).read_bytes())), encoding="utf-8")
     return str(done)

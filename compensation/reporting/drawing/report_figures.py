@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from thermostand.compensation.drift.evaluation import Evaluation, improvement_percent
+from thermostand.compensation.drift.evaluation import Evaluation, compute_improvement_percent
 from thermostand.compensation.drift.hysteresis import BranchDifference
 from thermostand.compensation.observations import Float, Observations
 from thermostand.compensation.reporting.drawing.figures import (
@@ -23,26 +23,26 @@ from thermostand.compensation.reporting.drawing.figures import (
     WARM_UP_COLOUR,
     Mark,
     Panel,
-    Paths,
-    arrows,
-    band,
-    curve,
-    dots,
-    histogram,
-    panels,
-    rule,
-    span,
-    trajectories,
-    words,
+    PathPanel,
+    draw_arrows,
+    draw_panels,
+    draw_trajectories,
+    make_band,
+    make_curve,
+    make_dots,
+    make_histogram,
+    make_rule,
+    make_span,
+    make_text,
 )
-from thermostand.compensation.reporting.numbers import TablePositions, percent
+from thermostand.compensation.reporting.report_numbers import TablePositions, format_percent
 from thermostand.compensation.reporting.tracks import (
     CycleVisit,
     Rows,
     WarmUpTrack,
-    mean_over_markers,
-    moved_px,
-    thinned,
+    average_over_markers,
+    compute_displacement_px,
+    thin,
 )
 from thermostand.experiments.steps import Role
 from thermostand.markers.target import Target
@@ -51,42 +51,42 @@ CURVE_POINTS = 400
 """Frames of a curve that are drawn; more only make the page larger."""
 _NS_PER_H, _S_PER_MIN = 3.6e12, 60.0
 _BETWEEN_SESSIONS_H = 0.5  # for the eye
-MOVED_ON_PURPOSE = tuple(str(role) for role in (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY))
+TARGET_MOVED_ROLES = tuple(str(role) for role in (Role.CALIBRATION, Role.POSE, Role.REPEATABILITY))
 
 
-def warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack], titles: Sequence[str]) -> Figure:
+def draw_warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack], titles: Sequence[str]) -> Figure:
     """Mean drift since the first frame, and the camera's temperature, against the time since it was switched on."""
     above, below = list[Panel](), list[Panel]()
     mean = "mean drift, " if len(curves) == 1 else ""
     for one, title in zip(curves, titles, strict=True):
-        drawn = thinned(len(one.since_on_s), CURVE_POINTS)
+        drawn = thin(len(one.since_on_s), CURVE_POINTS)
         minutes = one.since_on_s[drawn] / _S_PER_MIN
         look: dict[str, Any] = {"linewidth": 0.9, "marker": "o" if len(drawn) <= 100 else None, "markersize": 2.4}
         drift = zip(COORDINATES, one.track.mean_px[drawn].T, strict=True)
-        marks = [curve(minutes, values, colour, f"{mean}{name}", **look) for (name, colour), values in drift]
+        marks = [make_curve(minutes, values, colour, f"{mean}{name}", **look) for (name, colour), values in drift]
         above.append(Panel(marks, title, look={"ylabel": "drift (px)"}))
         camera_degC = observations.camera_degC[one.track.frames[drawn]]
         since = "it was switched on" if one.power_on_known else "the first frame"
         labels = {"xlabel": f"time since {since} (min)", "ylabel": "camera (°C)"}
-        below.append(Panel([curve(minutes, camera_degC, CAMERA_COLOUR, **look)], legend=0, look=labels))
-    return panels(len(curves), 4.0, [*above, *below])
+        below.append(Panel([make_curve(minutes, camera_degC, CAMERA_COLOUR, **look)], legend=0, look=labels))
+    return draw_panels(len(curves), 4.0, [*above, *below])
 
 
-def against_time(observations: Observations) -> Figure:
+def draw_against_time(observations: Observations) -> Figure:
     """Mean drift along I and J, and below it the temperatures, against the hours since the first frame; at the foot
     those that a thermal imager saw, where there was one.
 
     Time between sessions is left out; a session begins at a dashed line. Frames of a target that was moved on purpose
     are not drift: they are a grey band.
     """
-    hours, starts = _recorded_hours(observations)
-    mean, runs = mean_over_markers(moved_px(observations)), _runs(observations)
+    hours, starts = _compute_hours(observations)
+    mean, runs = average_over_markers(compute_displacement_px(observations)), _split_runs(observations)
 
     def broken(values: Float, colour: str, label: str) -> Iterator[Mark]:
         kept = [good for run in runs if len(good := run[np.isfinite(values[run])])]
         for number, good in enumerate(kept):
             look = {"linewidth": 0.8, "marker": "o", "markersize": 2.2}
-            yield curve(hours[good], values[good], colour, None if number else label, **look)
+            yield make_curve(hours[good], values[good], colour, None if number else label, **look)
 
     (i, i_colour), (j, j_colour) = COORDINATES
     rows = {
@@ -100,18 +100,18 @@ def against_time(observations: Observations) -> Figure:
         ],
     }
     if any(session.spots for session in observations.sessions):
-        rows["thermal imager (°C)"] = [*_spots(observations, starts)]
+        rows["thermal imager (°C)"] = [*_mark_spots(observations, starts)]
     behind = [
-        *_bands(hours, observations, (str(Role.WARM_UP),), WARM_UP_COLOUR, "warm-up"),
-        *_bands(hours, observations, MOVED_ON_PURPOSE, "#bbbbbb", "target moved"),
-        *(rule(start, upright=True) for start in starts[1:]),
+        *_mark_role_bands(hours, observations, (str(Role.WARM_UP),), WARM_UP_COLOUR, "warm-up"),
+        *_mark_role_bands(hours, observations, TARGET_MOVED_ROLES, "#bbbbbb", "target moved"),
+        *(make_rule(start, upright=True) for start in starts[1:]),
     ]
     time = "time since the first frame (h)"
     shown = [Panel([*marks, *behind], legend=4, look={"xlabel": time, "ylabel": name}) for name, marks in rows.items()]
-    return panels(1, 6.4 if len(rows) > 2 else 4.6, shown)
+    return draw_panels(1, 6.4 if len(rows) > 2 else 4.6, shown)
 
 
-def _spots(observations: Observations, starts: Sequence[float]) -> Iterator[Mark]:
+def _mark_spots(observations: Observations, starts: Sequence[float]) -> Iterator[Mark]:
     """What the thermal imager saw, from the first to the last frame of each session."""
     names = list(dict.fromkeys(name for session in observations.sessions for name in session.spots))
     for index, (session, start) in enumerate(zip(observations.sessions, starts, strict=True)):
@@ -122,12 +122,12 @@ def _spots(observations: Observations, starts: Sequence[float]) -> Iterator[Mark
             times_ns, degC = session.spots[name]
             within = (times_ns >= own[0]) & (times_ns <= own[-1])
             hours = start + (times_ns[within] - own[0]) / _NS_PER_H
-            drawn = thinned(len(hours), CURVE_POINTS)
+            drawn = thin(len(hours), CURVE_POINTS)
             colour = SPOT_COLOURS[number % len(SPOT_COLOURS)]
-            yield curve(hours[drawn], degC[within][drawn], colour, None if index else name, linewidth=0.9)
+            yield make_curve(hours[drawn], degC[within][drawn], colour, None if index else name, linewidth=0.9)
 
 
-def _recorded_hours(observations: Observations) -> tuple[Float, list[float]]:
+def _compute_hours(observations: Observations) -> tuple[Float, list[float]]:
     """Hours of each frame (F,), and of the begin of each session, sessions put end to end."""
     hours = np.zeros(len(observations.time_ns))
     starts, offset = list[float](), 0.0
@@ -140,56 +140,60 @@ def _recorded_hours(observations: Observations) -> tuple[Float, list[float]]:
     return hours, starts
 
 
-def _runs(observations: Observations) -> list[Rows]:
+def _split_runs(observations: Observations) -> list[Rows]:
     """Frames that a line may join: of one session, all drift or all of a moved target; thinned."""
-    moved = np.isin(observations.role, MOVED_ON_PURPOSE).astype(int)
-    return [run[thinned(len(run), CURVE_POINTS)] for run in _equal(2 * observations.session + moved)]
+    moved = np.isin(observations.role, TARGET_MOVED_ROLES).astype(int)
+    return [run[thin(len(run), CURVE_POINTS)] for run in _group_equal(2 * observations.session + moved)]
 
 
-def _equal(label: Rows) -> list[Rows]:
+def _group_equal(label: Rows) -> list[Rows]:
     """The places of neighbours with one label."""
     return np.split(np.arange(len(label)), np.flatnonzero(np.diff(label)) + 1)
 
 
-def _bands(hours: Float, observations: Observations, roles: tuple[str, ...], colour: str, label: str) -> Iterator[Mark]:
+def _mark_role_bands(
+    hours: Float, observations: Observations, roles: tuple[str, ...], colour: str, label: str
+) -> Iterator[Mark]:
     """Behind each run of frames with these roles in a session."""
     label_of_first: str | None = label
     run = np.where(np.isin(observations.role, roles), observations.session, -1)
-    for frames in _equal(run):
+    for frames in _group_equal(run):
         if run[frames[0]] >= 0:
-            yield span(float(hours[frames[0]]), float(hours[frames[-1]]), colour, label_of_first)
+            yield make_span(float(hours[frames[0]]), float(hours[frames[-1]]), colour, label_of_first)
             label_of_first = None
 
 
-def branches(
+def draw_branches(
     visits: Sequence[CycleVisit], before: Sequence[BranchDifference], after: Sequence[BranchDifference]
 ) -> Figure:
     """Mean drift at each set-point on the way up and down, and below it the gap between the two, before and after."""
     labels = {"xlabel": "chamber temperature (°C)"}
     drift = {**labels, "ylabel": "mean drift (px)"}
-    shown = [Panel([*_branch(visits, index)], look=drift) for index in range(2)]
+    shown = [Panel([*_mark_branch(visits, index)], look=drift) for index in range(2)]
     if before:
         gap = {**labels, "ylabel": "heating − cooling (mpx)"}
-        shown += [Panel([*_gaps(before, index), *_gaps(after, index, after=True)], look=gap) for index in range(2)]
-    return panels(2, 4.8 if before else 2.9, shown)
+        shown += [
+            Panel([*_mark_gaps(before, index), *_mark_gaps(after, index, after=True)], look=gap) for index in range(2)
+        ]
+    return draw_panels(2, 4.8 if before else 2.9, shown)
 
 
-def _branch(visits: Sequence[CycleVisit], index: int) -> Iterator[Mark]:
+def _mark_branch(visits: Sequence[CycleVisit], index: int) -> Iterator[Mark]:
     name, colour = COORDINATES[index]
     for one, two in pairwise(visits):
         ends = [one.chamber_degC, two.chamber_degC], [one.mean_px[index], two.mean_px[index]]
-        yield curve(*ends, colour, linestyle="-" if two.direction > 0 else ":")
+        yield make_curve(*ends, colour, linestyle="-" if two.direction > 0 else ":")
     for direction, marker, face, label in ((1, "^", colour, "heating"), (-1, "v", "white", "cooling")):
         own = [visit for visit in visits if visit.direction == direction]
         places = [visit.chamber_degC for visit in own], [visit.mean_px[index] for visit in own]
         look = {"marker": marker, "linestyle": "", "markerfacecolor": face, "markersize": 5}
-        yield curve(*places, colour, f"{name}, {label}", **look)
+        yield make_curve(*places, colour, f"{name}, {label}", **look)
 
 
-def _gaps(gaps: Sequence[BranchDifference], index: int, *, after: bool = False) -> Iterator[Mark]:
+def _mark_gaps(gaps: Sequence[BranchDifference], index: int, *, after: bool = False) -> Iterator[Mark]:
     if gaps:
         colour = COORDINATES[index][1]
-        yield curve(
+        yield make_curve(
             [gap.chamber_degC for gap in gaps],
             [1e3 * float(gap.difference_px[index]) for gap in gaps],
             colour,
@@ -199,7 +203,7 @@ def _gaps(gaps: Sequence[BranchDifference], index: int, *, after: bool = False) 
             marker="o",
             markerfacecolor=colour if after else "white",
         )
-        yield rule(0, style="-")
+        yield make_rule(0, style="-")
 
 
 _SIGMA_95 = 1.959964
@@ -207,7 +211,7 @@ _MOST_DOTS = 20_000  # more only make the page larger
 _BINS = 60
 
 
-def compensated_paths(observations: Observations, evaluation: Evaluation) -> Figure:
+def draw_compensated_paths(observations: Observations, evaluation: Evaluation) -> Figure:
     """The scored centres' drift x100, before and after compensation."""
     rows = evaluation.rows
     frames, place = np.unique(rows.frame, return_inverse=True)
@@ -220,29 +224,29 @@ def compensated_paths(observations: Observations, evaluation: Evaluation) -> Fig
     reference = np.full(shape[1:], np.nan)
     reference[seen] = np.nanmean(start[:, seen], axis=0)
     degC = observations.camera_degC[frames]
-    shown = [Paths("before", reference, before, degC), Paths("after compensation", reference, after, degC)]
-    return trajectories(observations, shown)
+    shown = [PathPanel("before", reference, before, degC), PathPanel("after compensation", reference, after, degC)]
+    return draw_trajectories(observations, shown)
 
 
-def measured_against_model(evaluation: Evaluation) -> Figure:
+def draw_measured_against_model(evaluation: Evaluation) -> Figure:
     """Each scored centre: the drift that was measured against the drift that the model says."""
     measured, said = -evaluation.before_px, evaluation.after_px - evaluation.before_px
-    drawn = thinned(len(measured), _MOST_DOTS)
+    drawn = thin(len(measured), _MOST_DOTS)
     shown: list[Panel] = []
     for index, (name, colour) in enumerate(COORDINATES):
         both = np.concatenate([said[:, index], measured[:, index]])
         ends = [float(both.min()), float(both.max())]
         marks: list[Mark] = [
-            curve(ends, ends, "black", "measured = model", linewidth=0.8),
-            dots(said[drawn, index], measured[drawn, index], colour, "marker centres"),
+            make_curve(ends, ends, "black", "measured = model", linewidth=0.8),
+            make_dots(said[drawn, index], measured[drawn, index], colour, "marker centres"),
             lambda axes: [scale.set_major_locator(MaxNLocator(5)) for scale in (axes.xaxis, axes.yaxis)],
         ]
         labels = {"xlabel": f"drift along {name}, model (px)", "ylabel": "" if index else "drift, measured (px)"}
         shown.append(Panel(marks, look={**labels, "aspect": "equal", "adjustable": "box"}))
-    return panels(2, 3.9, shown, share=False)
+    return draw_panels(2, 3.9, shown, share=False)
 
 
-def residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
+def draw_residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
     """What is left at each marker of each scored set-point, as arrows over the image."""
     rows = evaluation.rows
     keys = np.stack([rows.chamber_degC, rows.marker], axis=1)
@@ -250,26 +254,26 @@ def residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
     columns = (*rows.measured_px.T, *(-evaluation.after_px).T)
     mean = np.stack([np.bincount(index.ravel(), column) / count for column in columns], axis=1)
     chamber_degC = groups[:, 0].astype(np.float64)
-    return arrows(mean[:, :2], mean[:, 2:], observations.image_size, chamber_degC, "chamber temperature (°C)")
+    return draw_arrows(mean[:, :2], mean[:, 2:], observations.image_size, chamber_degC, "chamber temperature (°C)")
 
 
-def residuals(evaluation: Evaluation) -> Figure:
+def draw_residuals(evaluation: Evaluation) -> Figure:
     """What is left of each scored centre's deviation, against the camera's temperature, and the claimed interval."""
     camera_degC = evaluation.rows.camera_degC
     left_mpx = -1e3 * evaluation.after_px
-    drawn = thinned(len(left_mpx), _MOST_DOTS)
+    drawn = thin(len(left_mpx), _MOST_DOTS)
     places = np.unique(camera_degC)
     claimed = np.array([evaluation.claimed_px2[camera_degC == degC].mean(axis=0) for degC in places])
     reach_mpx = 1e3 * _SIGMA_95 * np.sqrt(claimed)
     labels = {"xlabel": "camera temperature (°C)", "ylabel": "measured − model (mpx)"}
     shown: list[Panel] = []
     for index, (name, colour) in enumerate(COORDINATES):
-        left = dots(camera_degC[drawn], left_mpx[drawn, index], colour, f"along {name}")
-        shown.append(Panel([band(places, reach_mpx[:, index], "95 % interval"), left], look=labels))
-    return panels(2, 3.0, shown)
+        left = make_dots(camera_degC[drawn], left_mpx[drawn, index], colour, f"along {name}")
+        shown.append(Panel([make_band(places, reach_mpx[:, index], "95 % interval"), left], look=labels))
+    return draw_panels(2, 3.0, shown)
 
 
-def deviation_histograms(evaluation: Evaluation) -> Figure:
+def draw_deviation_histograms(evaluation: Evaluation) -> Figure:
     """Deviations of the scored centres, along each axis: before compensation, and after it on a scale of its own."""
     shown: list[Panel] = []
     scales = (
@@ -280,11 +284,11 @@ def deviation_histograms(evaluation: Evaluation) -> Figure:
         for index, (name, colour) in enumerate(COORDINATES):
             label = f"{when}, RMS {factor * rms_px[index]:z.{digits}f} {unit}"
             labels = {"xlabel": f"deviation along {name} ({unit})", "ylabel": "" if index else "marker centres"}
-            shown.append(Panel([histogram(factor * values[:, index], _BINS, colour, label, **look)], look=labels))
-    return panels(2, 4.4, shown, share=False)
+            shown.append(Panel([make_histogram(factor * values[:, index], _BINS, colour, label, **look)], look=labels))
+    return draw_panels(2, 4.4, shown, share=False)
 
 
-def against_temperature(evaluation: Evaluation) -> Figure:
+def draw_against_temperature(evaluation: Evaluation) -> Figure:
     """RMS deviation at each scored chamber temperature, before and after compensation."""
     rows = evaluation.temperatures
     chamber_degC = [row.chamber_degC for row in rows]
@@ -292,42 +296,46 @@ def against_temperature(evaluation: Evaluation) -> Figure:
     shown: list[Panel] = []
     for index, (name, colour) in enumerate(COORDINATES):
         before, after = ([getattr(row, when)[index] for row in rows] for when in ("before_px", "after_px"))
-        gain = percent(improvement_percent(evaluation.rms_before_px[index], evaluation.rms_after_px[index]))
+        gain = format_percent(
+            compute_improvement_percent(evaluation.rms_before_px[index], evaluation.rms_after_px[index])
+        )
         open_look = {"marker": "o", "linestyle": "--", "markerfacecolor": "white", "markersize": 6}
         marks: list[Mark] = [
-            curve(chamber_degC, before, colour, f"{name}, before", **open_look),
-            curve(chamber_degC, after, colour, f"{name}, after ({gain} less)", marker="o", linewidth=1.3, markersize=6),
+            make_curve(chamber_degC, before, colour, f"{name}, before", **open_look),
+            make_curve(
+                chamber_degC, after, colour, f"{name}, after ({gain} less)", marker="o", linewidth=1.3, markersize=6
+            ),
             lambda axes: (axes.set_yscale("log"), axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))),
         ]
         shown.append(Panel(marks, look=labels))
-    return panels(2, 3.0, shown)
+    return draw_panels(2, 3.0, shown)
 
 
 _LABEL_MM = 12.0
 
 
-def positions_figure(positions: TablePositions, target: Target) -> Figure:
+def draw_positions(positions: TablePositions, target: Target) -> Figure:
     """The target at each position, seen from above: the camera looks from the left."""
     half_mm = float(np.ptp(target.coordinates_mm()[:, 0])) / 2
-    marks = [*_targets(positions.calibration, half_mm, GREY, 0.9, "calibration")]
-    marks += _targets(positions.poses, half_mm, J_COLOUR, 2.2, "validation")
+    marks = [*_mark_targets(positions.calibration, half_mm, GREY, 0.9, "calibration")]
+    marks += _mark_targets(positions.poses, half_mm, J_COLOUR, 2.2, "validation")
     for number, place in enumerate(positions.poses):
-        marks.append(words(*_end(*place, half_mm + _LABEL_MM), f"V{number}", J_COLOUR))
+        marks.append(make_text(*_locate_end(*place, half_mm + _LABEL_MM), f"V{number}", J_COLOUR))
     labels = {"xlabel": "linear table, away from the camera (mm)", "ylabel": "across (mm)"}
     marks.append(lambda axes: axes.margins(0.08))
-    return panels(1, 3.6, [Panel(marks, look={**labels, "aspect": "equal"})])
+    return draw_panels(1, 3.6, [Panel(marks, look={**labels, "aspect": "equal"})])
 
 
-def _targets(
+def _mark_targets(
     places: Sequence[tuple[float, float]], half_mm: float, colour: str, width: float, name: str
 ) -> Iterator[Mark]:
     for number, place in enumerate(places):
-        ends = np.array([_end(*place, side * half_mm) for side in (-1, 1)])
+        ends = np.array([_locate_end(*place, side * half_mm) for side in (-1, 1)])
         label = None if number else f"{name}, {len(places)} positions"
-        yield curve(ends[:, 0], ends[:, 1], colour, label, linewidth=width, solid_capstyle="round")
+        yield make_curve(ends[:, 0], ends[:, 1], colour, label, linewidth=width, solid_capstyle="round")
 
 
-def _end(linear_mm: float, rotary_deg: float, away_mm: float) -> tuple[float, float]:
+def _locate_end(linear_mm: float, rotary_deg: float, away_mm: float) -> tuple[float, float]:
     """A point of the target this far from its middle."""
     angle_rad = np.deg2rad(rotary_deg)
     return linear_mm + away_mm * float(np.sin(angle_rad)), away_mm * float(np.cos(angle_rad))

@@ -2,14 +2,22 @@
 
 from typing import Any, Literal
 
-from thermostand.drivers.devices.kinds import Arguments, Around, DeviceKind, Hands, Verb, VerbNumber, Work
+from thermostand.drivers.devices.kinds import (
+    Arguments,
+    DeviceKind,
+    DriverContext,
+    ManualActions,
+    Verb,
+    VerbNumber,
+    Work,
+)
 from thermostand.drivers.settings import Identity, Polled
 from thermostand.drivers.wires.line_client import LineClient
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.addresses import ByteAddress
-from thermostand.foundation.calls import Lane
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.readings import Channel, Reading
+from thermostand.foundation.workers import WorkerThread
 
 
 class Settings(Polled):
@@ -27,7 +35,7 @@ class Lamp:
         self.name = name
         self.identity: Identity | None = None
         self._clock = clock
-        self._lane: Lane | None = None
+        self._lane: WorkerThread | None = None
         self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0))
 
     async def _ask(self, text: str) -> str:
@@ -39,7 +47,7 @@ class Lamp:
 
     async def open(self) -> None:
         """Connect. Raises Unreachable when it does not answer."""
-        self._lane = self._lane or Lane(self.name, self._clock)
+        self._lane = self._lane or WorkerThread(self.name, self._clock)
         await self._ask("?")
         self.identity = Identity("Acme", "L1", "7", "")
 
@@ -64,11 +72,11 @@ class Lamp:
         await self.shine(0.0)
 
 
-def _make(name: str, settings: Settings, around: Around) -> Lamp:
+def _make(name: str, settings: Settings, around: DriverContext) -> Lamp:
     return Lamp(name, settings, around.clock)
 
 
-def _shine(stand: Hands, name: str, given: Arguments) -> Work:
+def _shine(stand: ManualActions, name: str, given: Arguments) -> Work:
     return stand.device(name).shine(given["percent"])
 
 

@@ -5,8 +5,8 @@ from typing import Any
 from pydantic import Field
 
 from thermostand.foundation.documents import Document
-from thermostand.stand.config.added_rules import GuardRule
-from thermostand.stand.fault import Fault, Readings, Watch, value_of
+from thermostand.stand.config.guard_rule_plugins import GuardRule
+from thermostand.stand.fault import Fault, Readings, Watch, get_value
 
 
 class Settings(Document):
@@ -20,7 +20,7 @@ def watches(settings: Settings, config: Any) -> list[Watch]:
     """What is judged every `guard.period_s`, how long it must object, and what is then done."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
-        value_degC = value_of(readings, "thermometers.laboratory")
+        value_degC = get_value(readings, "thermometers.laboratory")
         if value_degC > settings.limit_degC:
             return Fault("room_hot", f"the room of {config.name} is {value_degC:.1f} degC")
         return None

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pydantic import Field
 
 from thermostand.experiments.parameters import Chamber_degC, StillTable, Wait_s
-from thermostand.experiments.pieces import frames_through_flap, placed
+from thermostand.experiments.sequences import capture_through_flap, move_table
 from thermostand.experiments.steps import CloseFlap, Role, SetTemperature, Soak, StartChamber, Step, StopChamber
 
 
@@ -25,13 +25,13 @@ def staircase(parameters: Staircase) -> Iterator[Step]:
     """The steps, in order; pure: the same parameters give the same steps."""
     reference_degC = parameters.reference_degC
     yield CloseFlap()
-    yield from placed(parameters.table_position)
+    yield from move_table(parameters.table_position)
     yield StartChamber(reference_degC)
     yield Soak(parameters.soak_s)
-    yield from frames_through_flap(parameters, parameters.frames, Role.REFERENCE, reference_degC)
+    yield from capture_through_flap(parameters, parameters.frames, Role.REFERENCE, reference_degC)
     for stair in range(1, parameters.stairs + 1):
         for chamber_degC in (reference_degC + stair * parameters.stair_K, reference_degC):
             yield SetTemperature(chamber_degC)
             yield Soak(parameters.soak_s)
-            yield from frames_through_flap(parameters, parameters.frames, Role.FIT, chamber_degC)
+            yield from capture_through_flap(parameters, parameters.frames, Role.FIT, chamber_degC)
     yield StopChamber()

@@ -20,10 +20,10 @@ from thermostand.drivers.wires.camera_settings import (
     significant_bits,
 )
 from thermostand.drivers.wires.frame_count import FrameCount
-from thermostand.foundation.calls import Lane, Result
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.foundation.readings import Frame, Reading, bad_reading
+from thermostand.foundation.workers import Result, WorkerThread
 
 Settings = GigeCameraSettings
 ATTEMPTS = 3  # frames in a row that may fail before the camera counts as lost
@@ -38,7 +38,7 @@ class AravisCamera:
         self._name = name
         self.settings = settings
         self._clock = clock
-        self._lane: Lane | None = None
+        self._lane: WorkerThread | None = None
         self._connection: Connection | None = None
         self._lost = ""
         self._has_opened = False  # since it was made, or closed
@@ -56,7 +56,7 @@ class AravisCamera:
     @property
     def identity(self) -> Identity:
         """Vendor, model, serial number and version; Unreachable before `open`."""
-        return self._usable().identity
+        return self._require_connection().identity
 
     @property
     def is_usable(self) -> bool:
@@ -67,7 +67,7 @@ class AravisCamera:
     @property
     def effective(self) -> EffectiveSettings:
         """The settings as the camera took them; Unreachable before `open`."""
-        return self._usable().effective
+        return self._require_connection().effective
 
     def counters(self) -> dict[str, int]:
         """Counted since the camera was made: frames, triggers, missed, stale, incomplete_*, wrong_size, opened,
@@ -81,10 +81,10 @@ class AravisCamera:
         (tried for the heartbeat and 2 s more, since it may be our own that died).
         """
         if self._lane is None:
-            self._lane = Lane(self._name, self._clock)
+            self._lane = WorkerThread(self._name, self._clock)
         await self._call(self._connect)
         self._has_opened = True
-        self.restarted = self._why_restarted(self._usable().clock_began_ns)
+        self.restarted = self._explain_restart(self._require_connection().clock_began_ns)
         self._heard_ns = self._clock.now_ns()
 
     async def close(self) -> None:
@@ -102,11 +102,11 @@ class AravisCamera:
 
     async def start(self) -> None:
         """Start acquisition, always on a new stream."""
-        await self._call(self._usable().start)
+        await self._call(self._require_connection().start)
 
     async def stop(self) -> None:
         """Stop acquisition."""
-        await self._call(self._usable().stop)
+        await self._call(self._require_connection().stop)
 
     async def grab(self, exposure_s: float | None = None, due_ns: int = 0) -> Frame:
         """One complete frame that was exposed after the call; starts acquisition when it is not running.
@@ -116,7 +116,7 @@ class AravisCamera:
         Incomplete frames are never used, the next one is tried. Unreachable: control lost, or 3 failures in a row;
         Refused: exposure not taken.
         """
-        connection = self._usable()
+        connection = self._require_connection()
         wanted_s = self.settings.exposure_s if exposure_s is None else exposure_s
         if not connection.running:
             await self._call(connection.start)
@@ -127,7 +127,7 @@ class AravisCamera:
         return Frame(
             channel=f"{self._name}.image",
             image=shot.image,
-            time_ns=shot.start_ns + seconds_ns(shot.exposure_s / 2),
+            time_ns=shot.start_ns + to_ns(shot.exposure_s / 2),
             exposure_s=shot.exposure_s,
             gain_dB=connection.effective.gain_dB,
             camera_degC=shot.camera_degC,
@@ -144,8 +144,8 @@ class AravisCamera:
         channel = f"{self._name}.temperature"
         if not self._has_opened:
             return (bad_reading(channel, "degC", self._clock.now_ns(), "the camera is closed"),)
-        value_degC, reason, cause = await self._call(self._usable().temperature)
-        self._usable()
+        value_degC, reason, cause = await self._call(self._require_connection().temperature)
+        self._require_connection()
         time_ns = self._clock.now_ns()
         if cause != "wire":
             self._heard_ns = time_ns
@@ -153,15 +153,15 @@ class AravisCamera:
             return (bad_reading(channel, "degC", time_ns, reason, cause),)
         return (Reading(channel, value_degC, "degC", time_ns),)
 
-    async def temperature_place(self) -> str:
+    async def describe_temperature_place(self) -> str:
         """Which feature shows the temperature, and what the camera offers for its selector, in words; "" when none was
         found: `read` then says why."""
-        return await self._call(self._usable().temperature_place)
+        return await self._call(self._require_connection().temperature_place)
 
     async def _grab_triggered(self, connection: Connection, exposure_s: float, due_ns: int) -> Shot:
         for _ in range(ATTEMPTS):
             shot = await self._call(connection.trigger, exposure_s, due_ns)
-            self._usable()
+            self._require_connection()
             if shot is not None:
                 return shot
         raise self._lose(f"{ATTEMPTS} software triggers brought no complete frame")
@@ -172,8 +172,8 @@ class AravisCamera:
         await self._call(connection.prepare, exposure_s)
         for _ in range(ATTEMPTS):
             await self._clock.sleep_until(connection.next_frame_due_ns(max(called_ns, self._clock.now_ns())))
-            shot = await self._call(connection.next_free, called_ns)
-            self._usable()
+            shot = await self._call(connection.take_next_free, called_ns)
+            self._require_connection()
             if shot is not None:
                 return shot
         raise self._lose(f"{ATTEMPTS} frame periods brought no complete frame")
@@ -189,7 +189,7 @@ class AravisCamera:
                 raise self._lose(f"control lost: {error}") from error
             raise device_error(self._name, error) from error
 
-    def _usable(self) -> Connection:
+    def _require_connection(self) -> Connection:
         """The connection, or Unreachable until the next `open`."""
         if self._connection is None:
             raise Unreachable(self._name, "not open")
@@ -204,13 +204,13 @@ class AravisCamera:
         self._lost = reason
         return Unreachable(self._name, reason)
 
-    def _why_restarted(self, clock_began_ns: int | None) -> str:
+    def _explain_restart(self, clock_began_ns: int | None) -> str:
         """A camera that has restarted counts its time from then on."""
         if self._heard_ns is None:
             return ""
         if clock_began_ns is None:
             return "the camera was lost, and has no clock that shows whether it has restarted"
-        is_younger = clock_began_ns > self._heard_ns - seconds_ns(_CLOCK_SLACK_S)
+        is_younger = clock_began_ns > self._heard_ns - to_ns(_CLOCK_SLACK_S)
         return "the camera was lost and has restarted: its clock began after its last answer" if is_younger else ""
 
     def _connect(self) -> None:

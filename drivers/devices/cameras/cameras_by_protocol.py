@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union, cast
 from pydantic import Discriminator, Tag
 
 import thermostand.drivers.devices.cameras
-from thermostand.drivers.devices.cameras.shared_line import camera_lines, on_line
-from thermostand.drivers.devices.checking import Add, DeviceLook, Finding
-from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, LockedPlace, Verb, VerbNumber
+from thermostand.drivers.devices.cameras.shared_line import add_line_share, compute_line_shares
+from thermostand.drivers.devices.device_check import Add, DeviceCheck, Finding
+from thermostand.drivers.devices.kinds import Absence, DeviceKind, DriverContext, LockedPlace, Verb, VerbNumber
 from thermostand.drivers.devices.protocols import Camera
 from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.drivers.settings import CameraSettings
@@ -40,7 +40,7 @@ class _Driver(Protocol):
     def Camera(self, name: str, settings: Any, clock: Clock) -> Camera: ...
 
 
-def _found() -> dict[str, _Driver]:
+def _load_drivers() -> dict[str, _Driver]:
     names = sorted(module.name for module in pkgutil.iter_modules(thermostand.drivers.devices.cameras.__path__))
     return {
         name.removeprefix(_PREFIX): cast(
@@ -51,10 +51,10 @@ def _found() -> dict[str, _Driver]:
     }
 
 
-PROTOCOLS = _found()
+PROTOCOLS = _load_drivers()
 
 
-def _protocol_of(value: object) -> object:
+def _get_protocol(value: object) -> object:
     if isinstance(value, dict):
         return f"{TAG}{cast('dict[str, object]', value).get('protocol', _USUAL)}"
     return f"{TAG}{getattr(value, 'protocol', None)}"
@@ -67,20 +67,20 @@ elif len(PROTOCOLS) == 1:
 else:
     _tagged = tuple(Annotated[driver.Settings, Tag(f"{TAG}{name}")] for name, driver in PROTOCOLS.items())
     _of_protocol = Discriminator(
-        _protocol_of,
+        _get_protocol,
         custom_error_type="camera_protocol",
         custom_error_message=f"protocol has to be one of {', '.join(PROTOCOLS)}",
     )
     AnyCameraSettings = Annotated[Union[_tagged], _of_protocol]  # noqa: UP007 - of a tuple
 
 
-def _make(name: str, settings: CameraSettings, around: Around) -> Camera:
+def _make(name: str, settings: CameraSettings, around: DriverContext) -> Camera:
     """The camera of these settings, not opened."""
     driver = next(driver for driver in PROTOCOLS.values() if type(settings) is driver.Settings)
-    return driver.Camera(name, on_line(settings, around.of_section("cameras").values()), around.clock)
+    return driver.Camera(name, add_line_share(settings, around.of_section("cameras").values()), around.clock)
 
 
-def _places(settings: CameraSettings) -> Iterator[LockedPlace]:
+def _list_places(settings: CameraSettings) -> Iterator[LockedPlace]:
     yield LockedPlace("host", settings.address)
     if settings.serial_number is not None:
         yield LockedPlace("number", f"camera {settings.serial_number}")
@@ -92,7 +92,7 @@ def _advise(error: DeviceError, name: str, settings: CameraSettings) -> str:
     return f"compare cameras.{name} in the stand's file with the camera"
 
 
-def packet_finding(name: str, address: str, packet_size: int) -> Finding:
+def check_packets(name: str, address: str, packet_size: int) -> Finding:
     """Whether the network interface towards the camera takes its packets whole: larger ones are lost, or come in
     pieces that the camera does not send again."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as towards:
@@ -110,31 +110,31 @@ def packet_finding(name: str, address: str, packet_size: int) -> Finding:
     return Finding(name, "packets", "ok", text, data=data)
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Its settings, its temperature and its line; one without supply is left alone."""
     await _check_powered(look)
-    for finding in line_findings(look.of_section("cameras"), look.name):
+    for finding in check_line(look.of_section("cameras"), look.name):
         look.add(finding)
 
 
-def line_findings(cameras: Mapping[str, CameraSettings], name: str) -> Iterator[Finding]:
+def check_line(cameras: Mapping[str, CameraSettings], name: str) -> Iterator[Finding]:
     """What the camera of that name needs of its line, by the stand's file; none for one that has a line of its own."""
-    for line in camera_lines(cameras):
+    for line in compute_line_shares(cameras):
         if line.name == name and line.shared_by > 1:
             fits = line.frame_s <= 1 / cameras[name].frame_rate_hz
             text = str(line).removeprefix(f"{name}: ")
             yield Finding(name, "line", "ok" if fits else "failed", text, "" if fits else _ADVICE, asdict(line))
 
 
-async def _check_powered(look: DeviceLook) -> None:
-    if not await _has_supply(look):
+async def _check_powered(look: DeviceCheck) -> None:
+    if not await _is_supplied(look):
         if not look.is_powered_later:
             text = "its supply is off, so it was not asked"
             look.found("link", "unverified", text, "`stand check --moves` switches it on")
         return
     if "relays" not in look.opened:
         look = replace(look, advise=_mend_relays)
-    await look.answers()
+    await look.open_and_read()
     if look.name in look.opened:
         await check_settings(look.device, look.add)
 
@@ -148,14 +148,14 @@ async def check_settings(camera: Camera, add: Add) -> None:
     effective = cast("Any", getattr(camera, "effective", None))
     data: dict[str, object] = asdict(cast("Any", effective)) if is_dataclass(effective) else {}
     size = f"{data['width_px']} x {data['height_px']} {data['pixel_format']}, " if "width_px" in data else ""
-    data["temperature_place"] = await camera.temperature_place()
+    data["temperature_place"] = await camera.describe_temperature_place()
     add(Finding(camera.name, "settings", "ok", f"{size}settings taken over and read back", data=data))
     packet_size = data.get("packet_size")
     if isinstance(packet_size, int) and packet_size:  # a USB3 camera has none
-        add(packet_finding(camera.name, camera.settings.address, packet_size))
+        add(check_packets(camera.name, camera.settings.address, packet_size))
 
 
-async def _has_supply(look: DeviceLook) -> bool:
+async def _is_supplied(look: DeviceCheck) -> bool:
     """As far as the relays tell."""
     if "relays" not in look.opened:
         return True
@@ -174,7 +174,7 @@ KIND = DeviceKind(
     section="cameras",
     rank=90,
     is_opened=False,  # when it has its supply
-    places=_places,
+    places=_list_places,
     missing=Absence("cameras", "a recipe that takes frames is refused"),
     advise=_advise,
     check=_check,

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from thermostand.drivers.settings import CameraSettings
-from thermostand.drivers.wires.camera_line import frame_wire_s, packet_delay_ns
+from thermostand.drivers.wires.camera_line import compute_frame_wire_s, compute_packet_delay_ns
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings, frame_bytes
 
 _SENSOR_PX = (2448, 2048)  # of a camera whose size nobody states, as in the plan's estimate of the disk
 _PACKET_SIZE = 1500  # of a camera that finds its own: what every network carries
 
 
-def on_line(settings: CameraSettings, cameras: Iterable[CameraSettings]) -> CameraSettings:
+def add_line_share(settings: CameraSettings, cameras: Iterable[CameraSettings]) -> CameraSettings:
     """The settings; those of a GigE camera with the number of cameras on its line, which are all GigE cameras of the
     stand unless the stand's file states it."""
     if not isinstance(settings, GigeCameraSettings) or settings.line_shared_by is not None:
@@ -43,21 +43,21 @@ class CameraLine:
         )
 
 
-def camera_lines(cameras: Mapping[str, CameraSettings]) -> tuple[CameraLine, ...]:
+def compute_line_shares(cameras: Mapping[str, CameraSettings]) -> tuple[CameraLine, ...]:
     """Of each GigE camera, in the order of the stand's file."""
     lines: list[CameraLine] = []
     for name, camera in cameras.items():
-        settings = on_line(camera, cameras.values())
+        settings = add_line_share(camera, cameras.values())
         if not isinstance(settings, GigeCameraSettings):
             continue
         shared_by, packet_size = settings.line_shared_by or 1, settings.packet_size or _PACKET_SIZE
         delay_ns = settings.packet_delay_ns
         if delay_ns is None:
-            delay_ns = packet_delay_ns(packet_size, settings.line_Mbps, shared_by)
+            delay_ns = compute_packet_delay_ns(packet_size, settings.line_Mbps, shared_by)
         pixels = (settings.width_px or _SENSOR_PX[0]) * (settings.height_px or _SENSOR_PX[1])
         size = frame_bytes(settings.pixel_format, pixels)
-        alone_s = frame_wire_s(size, packet_size, settings.line_Mbps)
-        frame_s = frame_wire_s(size, packet_size, settings.line_Mbps, delay_ns)
+        alone_s = compute_frame_wire_s(size, packet_size, settings.line_Mbps)
+        frame_s = compute_frame_wire_s(size, packet_size, settings.line_Mbps, delay_ns)
         lines.append(
             CameraLine(
                 name, shared_by, settings.line_Mbps, packet_size, delay_ns, frame_s, alone_s * settings.frame_rate_hz
@@ -66,9 +66,9 @@ def camera_lines(cameras: Mapping[str, CameraSettings]) -> tuple[CameraLine, ...
     return tuple(lines)
 
 
-def overloaded(cameras: Mapping[str, CameraSettings], interval_s: float) -> str:
+def explain_overload(cameras: Mapping[str, CameraSettings], interval_s: float) -> str:
     """Why the line does not carry a frame of each camera every `interval_s`, "" when it does."""
-    for line in camera_lines(cameras):
+    for line in compute_line_shares(cameras):
         if line.frame_s > interval_s:
             return (
                 f"a frame every {interval_s} s is faster than the line of {line.line_Mbps:g} Mbit/s that "

@@ -75,7 +75,7 @@ class Ascii2Language(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
     in_force_by = "the nominal value in the reply to I, which a program moves"
-    not_told = (
+    not_reported = (
         "whether a program runs that has not moved it yet, whether EXTERN is on before something is written, a ramp "
         "whose target it shows, and the unit of temperatures, which the stand compares with its own thermometer"
     )

@@ -36,13 +36,13 @@ _NO_PROGRAM = 0
 _NO_ERROR = {0x00, 0x30}  # code bytes
 
 
-def framed(unit: int, text: str) -> bytes:
+def wrap_frame(unit: int, text: str) -> bytes:
     """The frame of a text: framed(1, "O") = 02 81 CF CE 03."""
     body = bytes([_HIGH | unit, *(byte | _HIGH for byte in text.encode("latin-1"))])
     return bytes([_STX, *body, reduce(xor, body) | _HIGH, _ETX])
 
 
-def unframed(unit: int, heard: bytes) -> str | None:
+def unwrap_frame(unit: int, heard: bytes) -> str | None:
     """The text of the frame that has come; None until it is whole; ValueError when it is none, or another unit's."""
     if not heard.endswith(bytes([_ETX])) or len(heard) < 4:
         return None
@@ -75,7 +75,7 @@ Settings = CtsSettings
 class CtsLanguage(ChamberLanguage):
     """One CTS chamber."""
 
-    not_told = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
+    not_reported = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
 
     def __init__(self, name: str, settings: CtsSettings) -> None:
         self._is_serial = settings.address.startswith("serial:")  # a frame has no bytes of flow control, bare text may
@@ -88,7 +88,7 @@ class CtsLanguage(ChamberLanguage):
             ("A0 tells the set-point", *(text for text, is_asked in asked.items() if is_asked))
         )
         if unasked := [text for text, is_asked in asked.items() if not is_asked]:
-            self.not_told = f"{', '.join(unasked)} (not asked); {self.not_told}"
+            self.not_reported = f"{', '.join(unasked)} (not asked); {self.not_reported}"
 
     def state(self) -> ChamberState:
         """Of A0, S, and F when there is an error."""
@@ -97,7 +97,7 @@ class CtsLanguage(ChamberLanguage):
         alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
         if flags[2] == "0":
             alarms = (*alarms, "it is paused")
-        is_open = self._door_reply is not None and self.client.query(*self._asked("O", self._door_reply, _door_open))
+        is_open = self._door_reply is not None and self.client.query(*self._asked("O", self._door_reply, _parse_door))
         return ChamberState(
             actual,
             nominal,
@@ -122,10 +122,10 @@ class CtsLanguage(ChamberLanguage):
 
     def _objections(self) -> Iterator[str]:
         if self._program_reply is not None:
-            number = self.client.query(*self._asked("P", self._program_reply, _program))
+            number = self.client.query(*self._asked("P", self._program_reply, _parse_program))
             if number != _NO_PROGRAM:
                 yield f"{PROGRAM} (number {number})"
-        if self._ramp_reply is not None and self.client.query(*self._asked("R1", self._ramp_reply, _ramps)):
+        if self._ramp_reply is not None and self.client.query(*self._asked("R1", self._ramp_reply, _parse_ramps)):
             yield "a ramp of its own runs (R1), and the set-point is reached only by it; end it at the panel"
 
     def _error_text(self, code: str) -> str:
@@ -147,7 +147,7 @@ class CtsLanguage(ChamberLanguage):
 
         def answer(heard: bytes) -> Found | None:
             if self._is_serial:
-                reply = unframed(self._unit, heard)
+                reply = unwrap_frame(self._unit, heard)
             else:
                 reply = heard.decode("latin-1") if len(heard) >= length else None
             if reply is None:
@@ -156,19 +156,19 @@ class CtsLanguage(ChamberLanguage):
                 raise ValueError(f"not a reply to {text!r}")
             return found
 
-        return framed(self._unit, text) if self._is_serial else text.encode("ascii"), answer
+        return wrap_frame(self._unit, text) if self._is_serial else text.encode("ascii"), answer
 
 
-def _program(text: str) -> int | None:
+def _parse_program(text: str) -> int | None:
     return int(text[1:]) if text[:1] == "P" and text[1:].isdecimal() else None
 
 
-def _ramps(text: str) -> bool | None:
+def _parse_ramps(text: str) -> bool | None:
     found = re.match(r"R1 ([01])([01]) ", text)
     return found[2] == "1" if found else None
 
 
-def _door_open(text: str) -> bool | None:
+def _parse_door(text: str) -> bool | None:
     """Of O, start, error, unused, flags: bit 2 is set while the door is closed (example of the manual)."""
     return not ord(text[4]) & _DOOR_CLOSED if text[:1] == "O" else None
 

@@ -17,7 +17,7 @@ from thermostand.drivers.devices.chambers.chamber_language import (
     ChamberLanguage,
     ChamberState,
     ChamberUnitSettings,
-    whole_line,
+    parse_line,
 )
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import GarbledReply, Refused
@@ -52,7 +52,7 @@ class EspecLanguage(ChamberLanguage):
     """One ESPEC chamber."""
 
     in_force_by = "TEMP? tells the set-point that acts, MON? whether a program runs"
-    not_told = "the unit of temperatures, which the stand compares with its own thermometer"
+    not_reported = "the unit of temperatures, which the stand compares with its own thermometer"
 
     def __init__(self, name: str, settings: EspecSettings) -> None:
         super().__init__(name, settings, SerialSettings(settings.baud, 1))
@@ -112,7 +112,7 @@ class EspecLanguage(ChamberLanguage):
 
     def _limited(self, heard: bytes) -> list[float] | None:
         """Actual, set, high and low limit; None until they have come whole."""
-        line = whole_line(heard)
+        line = parse_line(heard)
         if line is None:
             return None
         self._refuse(line, "TEMP?")
@@ -120,7 +120,7 @@ class EspecLanguage(ChamberLanguage):
 
     def _monitor(self, heard: bytes) -> tuple[float, str, str, int] | None:
         """Temperature, humidity, mode, number of alarms; None until they have come whole."""
-        line = whole_line(heard)
+        line = parse_line(heard)
         if line is None:
             return None
         self._refuse(line, "MON?")
@@ -135,12 +135,12 @@ class EspecLanguage(ChamberLanguage):
         return len(fields) > 1 and bool(_NUMBER.fullmatch(fields[1].strip()))
 
     def _ask(self, command: str) -> str:
-        line = self.client.query(self._bytes(command), whole_line)
+        line = self.client.query(self._bytes(command), parse_line)
         self._refuse(line, command)
         return line
 
     def _tell(self, command: str) -> None:
-        line = self.client.send(self._bytes(command), whole_line)
+        line = self.client.send(self._bytes(command), parse_line)
         self._refuse(line, command)
         if not line.startswith("OK:"):
             raise GarbledReply(self._name, f"{command!r} was answered by {line!r}")

@@ -19,7 +19,7 @@ from thermostand.drivers.devices.chambers.chamber_language import (
     ChamberLanguage,
     ChamberState,
     ChamberUnitSettings,
-    whole_line,
+    parse_line,
 )
 from thermostand.drivers.wires.link import SerialSettings
 from thermostand.foundation.errors import GarbledReply, Refused, Unreachable
@@ -30,7 +30,7 @@ _MANUAL = {"00", "01"}
 _REMOTE = {"02", "03"}
 _ABOUT_A_COMMAND = {"-08", "-09", "-10", "-11", "-13"}  # of the last one; the others are alarms and warnings
 _UNKNOWN = "-08"
-_TOLD = {
+_QUERIES = {
     "in_mode_01": "which working temperature acts",
     "in_mode_04": "whether a sensor outside is controlled",
     "in_sp_06": "whether temperatures are in degC",
@@ -42,9 +42,9 @@ _EXTERNAL = (
 _DEGF = "its temperatures are in degF (in_sp_06 is 1); choose degC at its panel"
 
 
-def number_of(heard: bytes) -> float | None:
+def parse_temperature(heard: bytes) -> float | None:
     """The temperature in a reply, degC; None until it has come whole; ValueError when it is none."""
-    line = whole_line(heard)
+    line = parse_line(heard)
     if line is None:
         return None
     if not _NUMBER.fullmatch(line.strip()):
@@ -52,9 +52,9 @@ def number_of(heard: bytes) -> float | None:
     return float(line)
 
 
-def status_of(heard: bytes) -> tuple[str, str] | None:
+def parse_status(heard: bytes) -> tuple[str, str] | None:
     """Code and words of a reply to `status`; None until it has come whole; ValueError when it is none."""
-    line = whole_line(heard)
+    line = parse_line(heard)
     if line is None:
         return None
     if (found := _STATUS.fullmatch(line)) is None:
@@ -97,25 +97,25 @@ class JulaboLanguage(ChamberLanguage):
 
     def _say(self) -> None:
         """What is told by the queries that this unit answers, and what is left open by the others."""
-        texts = [f"{query} tells {text}" for query, text in _TOLD.items() if query in self._asked]
+        texts = [f"{query} tells {text}" for query, text in _QUERIES.items() if query in self._asked]
         self.in_force_by = ", ".join((*texts, "status tells whether it is operated by hand"))
-        unknown = [text for query, text in _TOLD.items() if query not in self._asked]
-        self.not_told = f"{', '.join(unknown)}: compare with its panel" if unknown else ""
+        unknown = [text for query, text in _QUERIES.items() if query not in self._asked]
+        self.not_reported = f"{', '.join(unknown)}: compare with its panel" if unknown else ""
 
     def identity(self) -> str:
         """The reply to `version`."""
-        return self.client.query(b"version\r", whole_line)
+        return self.client.query(b"version\r", parse_line)
 
     def state(self) -> ChamberState:
         """Of the bath, and of its status: what that says of a command that it did not take is no alarm."""
         code, words = self._status()
-        mode = self.client.query(b"in_mode_05\r", whole_line)
+        mode = self.client.query(b"in_mode_05\r", parse_line)
         if mode not in ("0", "1"):
             raise GarbledReply(self._name, f"in_mode_05 was answered by {mode!r}")
         is_alarm = code.startswith("-") and code not in _ABOUT_A_COMMAND
         return ChamberState(
-            self.client.query(b"in_pv_00\r", number_of),
-            self.client.query(b"in_sp_00\r", number_of),
+            self.client.query(b"in_pv_00\r", parse_temperature),
+            self.client.query(b"in_sp_00\r", parse_temperature),
             mode == "1",
             (f"{code} {words}",) if is_alarm else (),
             objections=tuple(self._objections(code)),
@@ -149,7 +149,7 @@ class JulaboLanguage(ChamberLanguage):
         """A setting that not every unit has; "" when it does not know it, twice, and then it is not asked again."""
         for _ in range(2 if query in self._asked else 0):
             try:
-                answer = self.client.query(f"{query}\r".encode("ascii"), whole_line).strip()
+                answer = self.client.query(f"{query}\r".encode("ascii"), parse_line).strip()
             except Unreachable:  # -08 may be in the status only
                 if self._status()[0] != _UNKNOWN:
                     raise
@@ -164,7 +164,7 @@ class JulaboLanguage(ChamberLanguage):
         return ""
 
     def _status(self) -> tuple[str, str]:
-        code, words = self.client.query(b"status\r", status_of)
+        code, words = self.client.query(b"status\r", parse_status)
         if code.startswith("-") or code in _MANUAL | _REMOTE:
             return code, words
         raise GarbledReply(self._name, f"unknown status {code} {words}")

@@ -49,14 +49,14 @@ class ChamberLanguage(ABC):
     does not have something leaves that as it is here.
 
     client: of its requests. resolution_K: of a set-point. dead_man: what ends the heat when this computer dies, in
-    words. in_force_by, not_told: by which queries `state` knows that its set-point is the one that acts, and what they
-    leave open.
+    words. in_force_by, not_reported: by which queries `state` knows that its set-point is the one that acts, and
+    what they leave open.
     """
 
     resolution_K = 0.1
     dead_man = "nothing: it goes on at its set-point, within the limits of its own controller"
     in_force_by = ""
-    not_told = ""
+    not_reported = ""
 
     def __init__(self, name: str, settings: ChamberUnitSettings, line: SerialSettings, *, is_text: bool = True) -> None:
         self._name = name
@@ -92,7 +92,7 @@ class ChamberLanguage(ABC):
         """What keeps its own dead-man, if it has one, from stopping it."""
 
 
-def whole_line(heard: bytes) -> str | None:
+def parse_line(heard: bytes) -> str | None:
     """The line that has come, ASCII; None until it has ended; ValueError when it is not one."""
     if not heard.endswith(b"\n"):
         return None

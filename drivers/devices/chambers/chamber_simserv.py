@@ -40,7 +40,7 @@ _ALARM_MESSAGE = "1"  # of 17005
 _GRADIENTS = {11066: "upwards", 11070: "downwards"}  # K/min, 0 for none
 
 
-def reply_of(heard: bytes) -> tuple[str, list[str]] | None:
+def parse_reply(heard: bytes) -> tuple[str, list[str]] | None:
     """Code and values of a reply: ("1", ["24.98"]), ("-5", []); None until it has come whole; ValueError when it is
     none."""
     if not heard.endswith(b"\r\n"):
@@ -77,7 +77,7 @@ class SimservLanguage(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
     in_force_by = "11002 tells the set-point, 10010 whether a program runs, 11066 and 11070 whether a gradient is set"
-    not_told = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
+    not_reported = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
 
     def __init__(self, name: str, settings: SimservSettings) -> None:
         super().__init__(name, settings, SerialSettings(9600, 1))  # the line is of no meaning over TCP
@@ -157,13 +157,13 @@ class SimservLanguage(ChamberLanguage):
 
     def _text(self, command: int, *arguments: object) -> str:
         """The one value of a read."""
-        values = self._taken(command, self.client.query(self._request(command, arguments), reply_of))
+        values = self._taken(command, self.client.query(self._request(command, arguments), parse_reply))
         if len(values) != 1:
             raise GarbledReply(self._name, f"{command} was answered by {len(values)} values")
         return values[0].strip()
 
     def _tell(self, command: int, *arguments: object) -> None:
-        self._taken(command, self.client.send(self._request(command, arguments), reply_of))
+        self._taken(command, self.client.send(self._request(command, arguments), parse_reply))
 
     def _taken(self, command: int, reply: tuple[str, list[str]]) -> list[str]:
         code, values = reply

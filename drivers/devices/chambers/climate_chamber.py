@@ -15,15 +15,15 @@ from pydantic import Field
 
 import thermostand.drivers.devices.chambers
 from thermostand.drivers.devices.chambers.chamber_language import ChamberLanguage, ChamberState, ChamberUnitSettings
-from thermostand.drivers.devices.checking import check_controller
+from thermostand.drivers.devices.device_check import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, Around, DeviceKind
+from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, DeviceKind, DriverContext
 from thermostand.drivers.devices.protocols import InForce
-from thermostand.drivers.settings import Identity, same_device
-from thermostand.foundation.calls import Lane, Result
-from thermostand.foundation.clock import Clock, call_pause_s, seconds_ns
+from thermostand.drivers.settings import Identity, check_same_device
+from thermostand.foundation.clock import Clock, compute_call_pause_s, to_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from thermostand.foundation.readings import Reading
+from thermostand.foundation.workers import Result, WorkerThread
 
 _LOOKS = 3  # at a state that follows its command a scan of the unit later
 _RENEW_S = 60.0
@@ -35,7 +35,7 @@ class _Module(Protocol):
     def Language(self, name: str, settings: Any) -> ChamberLanguage: ...
 
 
-def _found() -> dict[str, _Module]:
+def _load_languages() -> dict[str, _Module]:
     """The languages: a file of each, beside this one, has `Language` and `Settings`, whose protocol is its name."""
     names = sorted(module.name for module in pkgutil.iter_modules(thermostand.drivers.devices.chambers.__path__))
     modules = {
@@ -46,7 +46,7 @@ def _found() -> dict[str, _Module]:
     return {name: cast("_Module", module) for name, module in modules.items() if hasattr(module, "Language")}
 
 
-LANGUAGES = _found()
+LANGUAGES = _load_languages()
 if TYPE_CHECKING:
     ClimateChamberSettings = ChamberUnitSettings
 else:
@@ -72,10 +72,10 @@ class ClimateChamber:
         self._allowed_degC = allowed_degC
         self._clock = clock
         module = next(language for language in LANGUAGES.values() if type(settings) is language.Settings)
-        gap_s = call_pause_s(clock, settings.gap_s)
+        gap_s = compute_call_pause_s(clock, settings.gap_s)
         self._language = module.Language(name, settings.model_copy(update={"gap_s": gap_s}))
         self.dead_man = self._language.dead_man
-        self._lane: Lane | None = None
+        self._worker: WorkerThread | None = None
         self._exclusive = Exclusive()
         self._sp_degC: float | None = None
         self._from_degC: float | None = None  # where a ramp to it began
@@ -84,14 +84,14 @@ class ClimateChamber:
 
     async def open(self) -> None:
         """Identity and limits; nothing is commanded. DeviceFault when it is another unit, or may be set too far."""
-        if self._lane is None:
-            self._lane = Lane(self.name, self._clock)
+        if self._worker is None:
+            self._worker = WorkerThread(self.name, self._clock)
         async with self._exclusive:
             await self._call(self._check)
 
     async def close(self) -> None:
         """Let go of the wire; the chamber goes on."""
-        lane, self._lane = self._lane, None
+        lane, self._worker = self._worker, None
         if lane is not None:
             await lane.call(self._language.client.close)
             lane.close()
@@ -99,17 +99,17 @@ class ClimateChamber:
     async def read(self) -> tuple[Reading, ...]:
         """pv, sp, running, fault; the reason of `fault` has its alarms and what was done at the panel."""
         async with self._exclusive:
-            state = await self._call(self._ready)
+            state = await self._call(self._identify_and_read)
             if self._is_run and state.running and self._clock.now_ns() >= self._renew_ns:
                 await self._call(self._language.renew)
-                self._renew_ns = self._clock.now_ns() + seconds_ns(_RENEW_S)
+                self._renew_ns = self._clock.now_ns() + to_ns(_RENEW_S)
             return self._readings(state)
 
     async def in_force(self) -> InForce:
         """As `Controller`."""
         async with self._exclusive:
-            state = await self._call(self._ready)
-            return InForce(self._language.in_force_by, self._language.not_told, state.objections)
+            state = await self._call(self._identify_and_read)
+            return InForce(self._language.in_force_by, self._language.not_reported, state.objections)
 
     async def set_temperature(self, degC: float) -> None:
         """Send a set-point, unless the unit has it, and read it back. Refused: outside what is allowed (nothing is
@@ -126,7 +126,7 @@ class ClimateChamber:
         its set-point is not in force."""
         async with self._exclusive:
             await self._call(self._start)
-            self._is_run, self._renew_ns = True, self._clock.now_ns() + seconds_ns(_RENEW_S)
+            self._is_run, self._renew_ns = True, self._clock.now_ns() + to_ns(_RENEW_S)
 
     async def stop(self) -> None:
         """Stop, confirmed."""
@@ -139,9 +139,9 @@ class ClimateChamber:
         await self.stop()
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
-        if self._lane is None:
+        if self._worker is None:
             raise Unreachable(self.name, "not open")
-        return await self._lane.call(function, *args)
+        return await self._worker.call(function, *args)
 
     # Below: in the lane's thread.
 
@@ -151,7 +151,7 @@ class ClimateChamber:
             raise DeviceFault(self.name, f"it says that it is {answer!r}, not {self._settings.identity!r}; not used")
         protocol = str(self._settings.model_dump()["protocol"])
         found = Identity("", answer or f"climate chamber that speaks {protocol}", "", "", by_map=not answer)
-        self.identity = same_device(self.name, found, self.identity)
+        self.identity = check_same_device(self.name, found, self.identity)
         self._check_limits()
         self._exclusive.is_known = True
 
@@ -172,14 +172,14 @@ class ClimateChamber:
                 "else limits it when this computer dies: set its limits at the panel",
             )
 
-    def _ready(self) -> ChamberState:
+    def _identify_and_read(self) -> ChamberState:
         """Its state, after it was made sure who answers."""
         if not (self._exclusive.is_known and self._language.client.connected):
             self._check()
         return self._language.state()
 
     def _set(self, degC: float) -> None:
-        state = self._ready()
+        state = self._identify_and_read()
         self._refuse_out_of_force(state)
         near_K = self._language.resolution_K / 2
         if abs(state.set_degC - degC) < near_K and (state.ramp_degC is None or self._sp_degC == degC):
@@ -188,14 +188,14 @@ class ClimateChamber:
         self._language.set_temperature(degC)
         for _ in range(_LOOKS):
             state = self._language.state()
-            if abs(state.set_degC - degC) < near_K or self._on_its_way(state, degC):
+            if abs(state.set_degC - degC) < near_K or self._is_ramping(state, degC):
                 return self._refuse_out_of_force(state)
         if abs(state.set_degC - self._from_degC) < near_K:
             text = f"not in control: the set-point {degC:g} degC had no effect"
             raise Refused(self.name, f"{text}; is remote control (EXTERN) on at the panel?")
         raise Refused(self.name, f"set to {degC:g} degC, it reads {state.set_degC:g} degC: clamped by the unit")
 
-    def _on_its_way(self, state: ChamberState, degC: float) -> bool:
+    def _is_ramping(self, state: ChamberState, degC: float) -> bool:
         """A nominal value that moves with the ramp lies between where it began and where it goes."""
         if state.ramp_degC is None or self._from_degC is None:
             return False
@@ -207,7 +207,7 @@ class ClimateChamber:
             raise DeviceFault(self.name, f"its set-point is not in force: {'; '.join(state.objections)}")
 
     def _start(self) -> None:
-        state = self._ready()
+        state = self._identify_and_read()
         if state.alarms:
             raise DeviceFault(self.name, f"{', '.join(state.alarms)}; look at the chamber, and reset it there")
         self._refuse_out_of_force(state)
@@ -220,7 +220,7 @@ class ClimateChamber:
     def _switch(self, on: bool) -> None:
         if not self._exclusive.is_known and on:
             self._check()
-        if not on and self._has_stopped():
+        if not on and self._try_stop():
             return
         self._language.run(on)
         for _ in range(_LOOKS):
@@ -230,7 +230,7 @@ class ClimateChamber:
         text = f"not in control: it did not {what}; is remote control (EXTERN) on at the panel?"
         raise DeviceFault(self.name, text)
 
-    def _has_stopped(self) -> bool:
+    def _try_stop(self) -> bool:
         """False also when that cannot be read: then it is stopped all the same."""
         try:
             return not self._language.state().running
@@ -241,23 +241,23 @@ class ClimateChamber:
         now_ns = self._clock.now_ns()
         faults, sp_degC = [*state.alarms, *state.objections], state.set_degC
         if self._sp_degC is not None:
-            if self._on_its_way(state, self._sp_degC):
+            if self._is_ramping(state, self._sp_degC):
                 sp_degC = self._sp_degC
             elif abs(sp_degC - self._sp_degC) >= self._language.resolution_K / 2:
                 faults.append(f"set point changed at the unit, from {self._sp_degC:g} to {sp_degC:g} degC")
-        doubt = "the door is open" if state.door_open else ""
-        faults += [doubt] if doubt and self._is_run else []
+        suspicion = "the door is open" if state.door_open else ""
+        faults += [suspicion] if suspicion and self._is_run else []
         if state.humidity_on and self._is_run:
             faults.append("humidity is on")
         return (
-            Reading(f"{self.name}.pv", state.actual_degC, "degC", now_ns, reason=doubt),
+            Reading(f"{self.name}.pv", state.actual_degC, "degC", now_ns, reason=suspicion),
             Reading(f"{self.name}.sp", sp_degC, "degC", now_ns),
             Reading(f"{self.name}.running", float(state.running), "1", now_ns),
             Reading(f"{self.name}.fault", float(bool(faults)), "1", now_ns, reason=", ".join(faults)),
         )
 
 
-def _make(name: str, settings: ChamberUnitSettings, around: Around) -> ClimateChamber:
+def _make(name: str, settings: ChamberUnitSettings, around: DriverContext) -> ClimateChamber:
     return ClimateChamber(name, settings, around.of_section("limits").chamber_degC, around.clock)
 
 

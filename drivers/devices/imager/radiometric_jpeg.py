@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.drivers.devices.imager.radiometry import Air, Planck, RadiometricSurroundings
-from thermostand.foundation.image_limit import size_fault
+from thermostand.foundation.image_limit import describe_size_fault
 
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _APP1, _SCAN, _END_OF_IMAGE = 0xE1, 0xDA, 0xD9
@@ -56,12 +56,12 @@ def is_whole(data: bytes) -> bool:
 def parse(data: bytes) -> RadiometricImage:
     """The image in a whole file; NotRadiometric."""
     try:
-        return _parsed(_records(_block(data)))
+        return _parse_records(_parse_directory(_join_block(data)))
     except struct.error as error:
         raise NotRadiometric(f"a record is cut short ({error})") from error
 
 
-def _segments(data: bytes) -> Iterator[bytes]:
+def _iterate_segments(data: bytes) -> Iterator[bytes]:
     """The contents of the APP1 segments before the picture itself."""
     at = 2
     while at + 4 <= len(data):
@@ -77,13 +77,13 @@ def _segments(data: bytes) -> Iterator[bytes]:
         at += 2 + size
 
 
-def _block(data: bytes) -> bytes:
+def _join_block(data: bytes) -> bytes:
     """The FFF block, put together from its numbered segments."""
     if not data.startswith(_START):
         raise NotRadiometric("it is no JPEG")
     pieces: dict[int, bytes] = {}
     lasts: set[int] = set()
-    for segment in _segments(data):
+    for segment in _iterate_segments(data):
         if segment.startswith(_FLIR) and len(segment) >= 8:
             if segment[6] in pieces:
                 raise NotRadiometric(f"it has its segment {segment[6]} twice")
@@ -96,7 +96,7 @@ def _block(data: bytes) -> bytes:
     return b"".join(pieces[number] for number in sorted(pieces))
 
 
-def _records(block: bytes) -> dict[int, tuple[int, bytes]]:
+def _parse_directory(block: bytes) -> dict[int, tuple[int, bytes]]:
     """Type -> subtype and content of the first record of each type."""
     if block[:4] not in (b"FFF\0", b"AFF\0"):
         raise NotRadiometric("its block is no FFF")
@@ -118,7 +118,7 @@ def _records(block: bytes) -> dict[int, tuple[int, bytes]]:
     return found
 
 
-def _parsed(records: Mapping[int, tuple[int, bytes]]) -> RadiometricImage:
+def _parse_records(records: Mapping[int, tuple[int, bytes]]) -> RadiometricImage:
     if _RAW not in records or _CAMERA not in records:
         raise NotRadiometric("it lacks the counts or the camera's constants")
     counts = _counts(records[_RAW][1])
@@ -151,7 +151,7 @@ def _counts(record: bytes) -> NDArray[np.uint16]:
     two, width, height = struct.unpack_from(f"{order}HHH", record)
     if two != 2:
         raise NotRadiometric("its counts have an unknown header")
-    if fault := size_fault(width, height):
+    if fault := describe_size_fault(width, height):
         raise NotRadiometric(f"its image {fault}")
     body = record[_RAW_HEADER_SIZE:]
     if body.startswith(_PNG):

@@ -80,7 +80,7 @@ class RadiometricSurroundings:
     window_transmission: float
 
 
-def temperatures_degC(
+def compute_temperatures_degC(
     raw: NDArray[np.uint16], planck: Planck, around: RadiometricSurroundings, emissivity: float
 ) -> NDArray[np.float64]:
     """Of a surface with this emissivity (0..1], in degC, shape of `raw`; NaN where the formula has no answer."""

@@ -19,13 +19,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from thermostand.drivers.devices.checking import DeviceLook, Finding
+from thermostand.drivers.devices.device_check import DeviceCheck, Finding
 from thermostand.drivers.devices.imager.radiometric_jpeg import NotRadiometric, RadiometricImage, is_whole, parse
-from thermostand.drivers.devices.imager.radiometry import temperatures_degC
-from thermostand.drivers.devices.kinds import Around, DeviceKind
+from thermostand.drivers.devices.imager.radiometry import compute_temperatures_degC
+from thermostand.drivers.devices.kinds import DeviceKind, DriverContext
 from thermostand.drivers.settings import DeviceName, Identity, Polled
-from thermostand.foundation.calls import Lane
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import Unreachable
 from thermostand.foundation.events import (
@@ -38,6 +37,7 @@ from thermostand.foundation.events import (
 )
 from thermostand.foundation.items import Event, Item, Original
 from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
+from thermostand.foundation.workers import WorkerThread
 
 _SUFFIXES = (".jpg", ".jpeg")
 _LARGEST_BYTES = 20_000_000  # round number; nothing was measured
@@ -63,20 +63,20 @@ class SpotSettings(Document):
     emissivity: float = Field(default=0.95, gt=0.05, le=1)
 
 
-def place_of(image: RadiometricImage, spot: SpotSettings) -> tuple[int, int]:
+def locate_spot(image: RadiometricImage, spot: SpotSettings) -> tuple[int, int]:
     """Where a spot is in a picture, x and y in px."""
     here = spot.x_px, spot.y_px
     return image.spots.get(spot.label, here) if spot.label else here
 
 
-def spot_degC(image: RadiometricImage, spot: SpotSettings) -> float | None:
+def measure_spot_degC(image: RadiometricImage, spot: SpotSettings) -> float | None:
     """The mean of the 3 x 3 px of a spot; NaN where the counts are of no temperature, None when they are not all within
     the picture."""
-    (x, y), (height, width) = place_of(image, spot), image.counts.shape
+    (x, y), (height, width) = locate_spot(image, spot), image.counts.shape
     if not (1 <= x < width - 1 and 1 <= y < height - 1):
         return None
     around = image.counts[y - 1 : y + 2, x - 1 : x + 2]
-    return float(temperatures_degC(around, image.planck, image.around, spot.emissivity).mean())
+    return float(compute_temperatures_degC(around, image.planck, image.around, spot.emissivity).mean())
 
 
 class ThermalImagerSettings(Polled):
@@ -94,7 +94,7 @@ class ThermalImagerSettings(Polled):
 
 
 @dataclass(frozen=True, slots=True)
-class _Stamp:
+class _FileStamp:
     """A file as the folder shows it; another size or time of change is another file."""
 
     size: int
@@ -102,10 +102,10 @@ class _Stamp:
 
 
 @dataclass(slots=True)
-class _Seen:
+class _SeenFile:
     """A file since it looks like `stamp`. settled: nothing more is to be done with it."""
 
-    stamp: _Stamp
+    stamp: _FileStamp
     first_ns: int
     since_ns: int
     settled: bool = False
@@ -127,8 +127,8 @@ class ThermalImager:
         self._settings = settings
         self._clock = clock
         self._publish = publish
-        self._lane: Lane | None = None
-        self._files: dict[str, _Seen] | None = None  # before the folder was there for the first time
+        self._worker: WorkerThread | None = None
+        self._files: dict[str, _SeenFile] | None = None  # before the folder was there for the first time
         self._lost = ""
         self._hashes: dict[str, str] = {}  # of the pictures that were taken, in order -> their names
         self._offset_s = math.inf
@@ -142,44 +142,44 @@ class ThermalImager:
 
     async def open(self) -> None:
         """Look into the folder, which may come later; the pictures that are there first are none of this stand's."""
-        if self._lane is None:
-            self._lane = Lane(self.name, self._clock)
+        if self._worker is None:
+            self._worker = WorkerThread(self.name, self._clock)
         self._latest_ns = self._clock.now_ns()
-        listed = await self._lane.call(self._listed)
+        listed = await self._worker.call(self._list_pictures)
         if not isinstance(listed, str):
             self._begin(listed)
 
     async def close(self) -> None:
         """Nothing to let go of but a thread; may be called twice."""
-        lane, self._lane = self._lane, None
+        lane, self._worker = self._worker, None
         if lane is not None:
             lane.close()
 
     async def read(self) -> tuple[Reading, ...]:
         """What the last picture says, once; STALE when it is older than stale_after_s, BAD before the first, and while
         the folder is gone (a card pulled out, a share not mounted)."""
-        if self._lane is None:
+        if self._worker is None:
             raise Unreachable(self.name, "not open")
-        listed = await self._lane.call(self._listed)
+        listed = await self._worker.call(self._list_pictures)
         now_ns = self._clock.now_ns()
-        self._tell_folder(listed if isinstance(listed, str) else "", now_ns)
+        self._report_folder(listed if isinstance(listed, str) else "", now_ns)
         if isinstance(listed, str):
-            before, self._last = self._last, self._bad(listed, now_ns)
+            before, self._last = self._last, self._make_bad_readings(listed, now_ns)
             return () if [each.reason for each in before] == [each.reason for each in self._last] else self._last
         if self._files is None:
             self._begin(listed)
-        for name in self._due(listed, now_ns):
-            for item in await self._lane.call(self._taken, name, now_ns):
+        for name in self._select_settled(listed, now_ns):
+            for item in await self._worker.call(self._take_picture, name, now_ns):
                 self._publish(item)
-        self._tell_age(now_ns)
-        before, self._last = self._last, self._present(now_ns)
+        self._report_age(now_ns)
+        before, self._last = self._last, self._get_readings(now_ns)
         return () if before == self._last else self._last
 
-    def _present(self, now_ns: int) -> tuple[Reading, ...]:
+    def _get_readings(self, now_ns: int) -> tuple[Reading, ...]:
         if not self._latest:
             if self._last and all(reading.reason == _NONE_YET for reading in self._last):
                 return self._last
-            return self._bad(_NONE_YET, now_ns)
+            return self._make_bad_readings(_NONE_YET, now_ns)
         if not self._is_stale:
             return self._latest
         reason = f"no picture for {self._settings.stale_after_s / 60:g} min"
@@ -190,14 +190,14 @@ class ThermalImager:
             for reading in self._latest
         )
 
-    def _bad(self, reason: str, now_ns: int) -> tuple[Reading, ...]:
+    def _make_bad_readings(self, reason: str, now_ns: int) -> tuple[Reading, ...]:
         channels = _channels_of(self._settings)
         return tuple(bad_reading(f"{self.name}.{each.name}", each.unit, now_ns, reason) for each in channels)
 
-    def _begin(self, listed: dict[str, _Stamp]) -> None:
-        self._files = {name: _Seen(stamp, 0, 0, settled=True) for name, stamp in listed.items()}
+    def _begin(self, listed: dict[str, _FileStamp]) -> None:
+        self._files = {name: _SeenFile(stamp, 0, 0, settled=True) for name, stamp in listed.items()}
 
-    def _tell_folder(self, lost: str, now_ns: int) -> None:
+    def _report_folder(self, lost: str, now_ns: int) -> None:
         """An event when the folder is lost, or is there again."""
         if lost and not self._lost:
             self._publish(PICTURES_LOST.at(now_ns, device=self.name, reason=lost))
@@ -205,21 +205,21 @@ class ThermalImager:
             self._publish(PICTURES_BACK.at(now_ns, device=self.name))
         self._lost = lost
 
-    def _due(self, listed: dict[str, _Stamp], now_ns: int) -> list[str]:
+    def _select_settled(self, listed: dict[str, _FileStamp], now_ns: int) -> list[str]:
         """The files that have not changed for settled_s, in order of their names."""
         self._files = {name: seen for name, seen in (self._files or {}).items() if name in listed}
         for name, stamp in listed.items():
             seen = self._files.get(name)
             if seen is None:
-                self._files[name] = _Seen(stamp, now_ns, now_ns)
+                self._files[name] = _SeenFile(stamp, now_ns, now_ns)
             elif seen.stamp != stamp:
-                self._files[name] = _Seen(stamp, seen.first_ns if not seen.settled else now_ns, now_ns)
-        settled_ns = seconds_ns(self._settings.settled_s)
+                self._files[name] = _SeenFile(stamp, seen.first_ns if not seen.settled else now_ns, now_ns)
+        settled_ns = to_ns(self._settings.settled_s)
         due = [name for name, seen in self._files.items() if not seen.settled and now_ns - seen.since_ns >= settled_ns]
         return sorted(due)[:_MOST_AT_ONCE]
 
-    def _tell_age(self, now_ns: int) -> None:
-        is_stale = now_ns - self._latest_ns > seconds_ns(self._settings.stale_after_s)
+    def _report_age(self, now_ns: int) -> None:
+        is_stale = now_ns - self._latest_ns > to_ns(self._settings.stale_after_s)
         if is_stale and not self._is_stale:
             minutes = self._settings.stale_after_s / 60
             self._publish(NO_PICTURE.at(self._clock.now_ns(), device=self.name, minutes=minutes))
@@ -227,9 +227,9 @@ class ThermalImager:
 
     # Below: in the lane's thread.
 
-    def _listed(self) -> dict[str, _Stamp] | str:
+    def _list_pictures(self) -> dict[str, _FileStamp] | str:
         """The pictures in the folder by name; why there are none."""
-        listed: dict[str, _Stamp] = {}
+        listed: dict[str, _FileStamp] = {}
         try:
             with os.scandir(self._settings.folder) as entries:
                 for entry in entries:
@@ -240,18 +240,18 @@ class ThermalImager:
                     except OSError:
                         continue  # gone since
                     if stat.S_ISREG(found.st_mode):
-                        listed[entry.name] = _Stamp(found.st_size, found.st_mtime_ns)
+                        listed[entry.name] = _FileStamp(found.st_size, found.st_mtime_ns)
         except OSError as error:
             return f"{self._settings.folder} cannot be listed ({error.strerror}); is it mounted?"
         return listed
 
-    def _taken(self, name: str, now_ns: int) -> list[Item]:
+    def _take_picture(self, name: str, now_ns: int) -> list[Item]:
         """What a settled file gives: a picture and what was found, or why not; nothing while it may still grow."""
         seen = (self._files or {})[name]
         try:
             data = self._content(name)
             if not is_whole(data):
-                if now_ns - seen.since_ns < seconds_ns(self._settings.incomplete_s):
+                if now_ns - seen.since_ns < to_ns(self._settings.incomplete_s):
                     return []
                 raise NotRadiometric(f"its end is missing, and nothing was added for {self._settings.incomplete_s:g} s")
             seen.settled = True
@@ -271,7 +271,7 @@ class ThermalImager:
         while len(self._hashes) > _KNOWN_HASHES:
             del self._hashes[next(iter(self._hashes))]
         clock_events = self._follow_clock(image.camera_s, seen.first_ns, now_ns) if image.camera_s > 0 else []
-        taken = self._credit(name, digest, image, seen.first_ns, now_ns)
+        taken = self._store_readings(name, digest, image, seen.first_ns, now_ns)
         return [Original(now_ns, self.name, name, data), *clock_events, taken]
 
     def _content(self, name: str) -> bytes:
@@ -293,23 +293,23 @@ class ThermalImager:
         # back.
         if self._late is None or abs(lag_s - self._late[1]) > apart_s:
             self._late = first_ns, lag_s
-        if first_ns - self._late[0] <= seconds_ns(apart_s):
+        if first_ns - self._late[0] <= to_ns(apart_s):
             return []
         by_s, self._offset_s, self._late = round(lag_s - self._offset_s), min(lag_s, self._late[1]), None
         return [CLOCK_SET_BACK.at(now_ns, device=self.name, by_s=by_s)]
 
-    def _credit(self, name: str, digest: str, image: RadiometricImage, first_ns: int, now_ns: int) -> Event:
+    def _store_readings(self, name: str, digest: str, image: RadiometricImage, first_ns: int, now_ns: int) -> Event:
         """Keep its readings, and say what they were made of."""
         vendor, _, model = image.model.partition(" ")
         self.identity = Identity(vendor, model, image.serial_number, image.software)
         time_ns = first_ns
         if image.camera_s > 0:
-            time_ns = min(now_ns, seconds_ns(image.camera_s + self._offset_s))
+            time_ns = min(now_ns, to_ns(image.camera_s + self._offset_s))
         readings = [*self._spots(image, time_ns), self._offset(time_ns)]
         if time_ns >= self._latest_ns or not self._latest:
             self._latest, self._latest_ns, self._is_stale = tuple(readings), max(time_ns, self._latest_ns), False
         around = image.around
-        plain = temperatures_degC(image.counts, image.planck, around, image.emissivity)
+        plain = compute_temperatures_degC(image.counts, image.planck, around, image.emissivity)
         data: dict[str, object] = {
             "device": self.name,
             "file": name,
@@ -335,9 +335,9 @@ class ThermalImager:
         height, width = image.counts.shape
         for spot, settings in self._settings.spots.items():
             channel = f"{self.name}.{spot}"
-            mean_degC = spot_degC(image, settings)
+            mean_degC = measure_spot_degC(image, settings)
             if mean_degC is None:
-                x, y = place_of(image, settings)
+                x, y = locate_spot(image, settings)
                 yield bad_reading(channel, "degC", time_ns, f"({x}, {y}) is not within the {width} x {height} px")
             elif math.isfinite(mean_degC):
                 yield Reading(channel, mean_degC, "degC", time_ns)
@@ -351,11 +351,11 @@ class ThermalImager:
         return Reading(channel, self._offset_s, "s", time_ns)
 
 
-def _make(name: str, settings: ThermalImagerSettings, around: Around) -> ThermalImager:
+def _make(name: str, settings: ThermalImagerSettings, around: DriverContext) -> ThermalImager:
     return ThermalImager(name, settings, around.clock, around.publish)
 
 
-def imager_finding(settings: ThermalImagerSettings) -> Finding:
+def check_folder(settings: ThermalImagerSettings) -> Finding:
     """Blocking: it reads a folder, and one picture."""
     folder = settings.folder
     try:
@@ -376,10 +376,10 @@ def imager_finding(settings: ThermalImagerSettings) -> Finding:
     except NotRadiometric as error:
         text = f"the newest picture, {newest.name}, has no temperatures: {error}"
         return Finding("imager", "reading", "failed", text, "set the imager to radiometric JPEG")
-    return _of_picture(settings, newest, image)
+    return _describe_picture(settings, newest, image)
 
 
-def _of_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricImage) -> Finding:
+def _describe_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricImage) -> Finding:
     which = f"{image.model}, serial number {image.serial_number}"
     if settings.serial_number not in (None, image.serial_number):
         text = f"the newest picture, {file.name}, is of a {which}, expected {settings.serial_number}"
@@ -387,9 +387,9 @@ def _of_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricI
     height, width = image.counts.shape
     seen: dict[str, object] = {}
     for name, spot in settings.spots.items():
-        mean_degC = spot_degC(image, spot)
+        mean_degC = measure_spot_degC(image, spot)
         if mean_degC is None:
-            x, y = place_of(image, spot)
+            x, y = locate_spot(image, spot)
             text = f"the 3 x 3 px of the spot {name} at {x}, {y} px are not within its {width} x {height} px"
             return Finding("imager", "settings", "failed", text, f"correct imager.spots.{name}")
         seen[name] = round(mean_degC, 1)
@@ -397,9 +397,9 @@ def _of_picture(settings: ThermalImagerSettings, file: Path, image: RadiometricI
     return Finding("imager", "reading", "ok", f"{which}; its newest picture, {file.name}, shows {texts}", data=seen)
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Not opened: what its folder has, and what the newest picture shows."""
-    look.add(await asyncio.to_thread(imager_finding, look.settings))
+    look.add(await asyncio.to_thread(check_folder, look.settings))
 
 
 def _channels_of(settings: ThermalImagerSettings) -> tuple[Channel, ...]:

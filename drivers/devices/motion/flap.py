@@ -14,13 +14,12 @@ import usb.core
 import usb.util
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import DeviceLook
-from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, LockedPlace, Verb
-from thermostand.drivers.devices.motion.motion import Motion, Turn
-from thermostand.drivers.settings import Identity, Polled, same_device
+from thermostand.drivers.devices.device_check import DeviceCheck
+from thermostand.drivers.devices.kinds import Absence, DeviceKind, DriverContext, LockedPlace, Verb
+from thermostand.drivers.devices.motion.motion import MotionArbiter, MotionCommand
+from thermostand.drivers.settings import Identity, Polled, check_same_device
 from thermostand.foundation.addresses import TcpAddress
-from thermostand.foundation.calls import Lane, Result
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import (
     ConfigError,
     DeviceError,
@@ -31,6 +30,7 @@ from thermostand.foundation.errors import (
     Unreachable,
 )
 from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
+from thermostand.foundation.workers import Result, WorkerThread
 
 _VENDOR_POLOLU = 0x1FFB
 _PRODUCTS_JRK_G2 = {0x00B7: "18v27", 0x00B9: "24v21", 0x00BF: "18v19", 0x00C1: "24v13", 0x00C5: "21v3"}
@@ -120,23 +120,23 @@ class Travel:
         self._confirmed = 0
 
     @property
-    def arrived(self) -> bool:
+    def has_arrived(self) -> bool:
         """It was at its target in three looks in a row."""
         return self._confirmed >= CONFIRMATIONS
 
     def look(self, position: int, saturated: bool, time_ns: int) -> str:
         """What is wrong, "" when nothing is; `time_ns` is when the position was read, `saturated` whether the motor
         gave (nearly) all it may."""
-        step_ns = min(max(0, time_ns - self._seen_ns), seconds_ns(_LONGEST_LOOK_S))
+        step_ns = min(max(0, time_ns - self._seen_ns), to_ns(_LONGEST_LOOK_S))
         self._seen_ns = time_ns
         self._watched_ns += step_ns
         self._still_ns += step_ns
         if abs(position - self._still_position) >= JAM_COUNTS:
             self._still_ns, self._still_position = 0, position
         self._confirmed = self._confirmed + 1 if abs(position - self._target) <= self._tolerance else 0
-        if saturated and self._still_ns >= seconds_ns(JAM_S):
+        if saturated and self._still_ns >= to_ns(JAM_S):
             return f"jammed at {position} on the way to {self._target}"
-        if not self._confirmed and self._watched_ns > seconds_ns(self._travel_s):
+        if not self._confirmed and self._watched_ns > to_ns(self._travel_s):
             return f"at {position}, not at {self._target}, after {self._travel_s:g} s"
         return ""
 
@@ -153,23 +153,23 @@ class Flap:
         self._settings = settings
         self._clock = clock
         self._backend = backend
-        self._lane: Lane | None = None
+        self._worker: WorkerThread | None = None
         self._device: _UsbDevice | None = None
         self._max_duty = (0, 0)
         self.identity: Identity | None = None  # which controller has answered
         self.is_shut = False  # the last movement has confirmed it
         self._commanded = False  # a target was sent and the motor not stopped since
-        self._motion = Motion(name)
+        self._motion = MotionArbiter(name)
 
     async def open(self) -> None:
         """Find the controller by its serial number and check its input mode; leaves the flap where it is."""
-        if self._lane is None:
-            self._lane = Lane(self.name, self._clock)
+        if self._worker is None:
+            self._worker = WorkerThread(self.name, self._clock)
         await self._call(self._find)
 
     async def close(self) -> None:
         """Let go of the USB device; the flap stays where it is. May be called twice."""
-        lane, self._lane = self._lane, None
+        lane, self._worker = self._worker, None
         if lane is not None:
             await lane.call(self._release)
             lane.close()
@@ -177,7 +177,7 @@ class Flap:
     async def read(self) -> tuple[Reading, ...]:
         """(position 0 closed .. 1 open, motor current mA). The position is BAD when the feedback is disconnected, and
         STALE, with the reason, when an error or a restart of the controller has taken the motor's force away."""
-        variables = await self._call(self._variables)
+        variables = await self._call(self._read_variables)
         now_ns = self._clock.now_ns()
         current = Reading(f"{self.name}.current", float(variables.current_mA), "mA", now_ns)
         channel = f"{self.name}.position"
@@ -186,7 +186,7 @@ class Flap:
         span = self._settings.open_target - self._settings.closed_target
         openness = (variables.position - self._settings.closed_target) / span
         if variables.halting & ~_AWAITING_COMMAND or (variables.halting and self._commanded):
-            reason = f"the motor is not driven: {_names(variables.halting)}"
+            reason = f"the motor is not driven: {_name_errors(variables.halting)}"
             return Reading(channel, openness, "1", now_ns, Quality.STALE, reason), current
         return Reading(channel, openness, "1", now_ns), current
 
@@ -212,28 +212,28 @@ class Flap:
         self._motion.bar()
         await self.move_closed()
 
-    async def _move(self, turn: Turn, target: int) -> None:
+    async def _move(self, turn: MotionCommand, target: int) -> None:
         self.is_shut = False
         await self._move_to(turn, target)
         self.is_shut = target == self._settings.closed_target
 
-    async def _move_to(self, turn: Turn, target: int) -> None:
+    async def _move_to(self, turn: MotionCommand, target: int) -> None:
         settings = self._settings
         begun = await self._call(self._set_target, turn, target)
         travel = Travel(target, settings.tolerance, settings.travel_s, begun.position, begun.time_ns)
-        while not travel.arrived:
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(POLL_S))
-            variables = await self._call(self._variables)
+        while not travel.has_arrived:
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(POLL_S))
+            variables = await self._call(self._read_variables)
             turn.check()
             if variables.halting or variables.target != target:
-                raise DeviceFault(self.name, f"the motor stopped: {_names(variables.halting)}")
-            if trouble := travel.look(variables.position, self._saturated(variables.duty), variables.time_ns):
+                raise DeviceFault(self.name, f"the motor stopped: {_name_errors(variables.halting)}")
+            if trouble := travel.look(variables.position, self._is_saturated(variables.duty), variables.time_ns):
                 await self._stop_after(turn, trouble)
 
-    def _saturated(self, duty: int) -> bool:
+    def _is_saturated(self, duty: int) -> bool:
         return duty != 0 and abs(duty) >= _JAM_DUTY * self._max_duty[duty < 0]
 
-    async def _stop_after(self, turn: Turn, reason: str) -> None:
+    async def _stop_after(self, turn: MotionCommand, reason: str) -> None:
         try:
             await self._call(self._stop_motor, turn)
         except Superseded:
@@ -243,9 +243,9 @@ class Flap:
         raise DeviceFault(self.name, f"{reason}; the motor is stopped")
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
-        if self._lane is None:
+        if self._worker is None:
             raise Unreachable(self.name, "not open")
-        return await self._lane.call(function, *args)
+        return await self._worker.call(function, *args)
 
     # Below: in the lane's thread.
 
@@ -262,16 +262,16 @@ class Flap:
             raise Unreachable(self.name, "libusb is not installed (Debian package libusb-1.0-0)") from error
         except (usb.core.USBError, ValueError, OSError) as error:
             raise Unreachable(self.name, f"USB devices cannot be listed ({error})") from error
-        self._device = self._chosen(candidates)
+        self._device = self._choose(candidates)
         try:
-            self.identity = same_device(self.name, self._identity_of(self._device), self.identity)
+            self.identity = check_same_device(self.name, self._read_identity(self._device), self.identity)
             self._check_settings(self._device)
         except DeviceError:
             self._release()
             raise
         return self._device
 
-    def _chosen(self, candidates: Iterable[_UsbDevice]) -> _UsbDevice:
+    def _choose(self, candidates: Iterable[_UsbDevice]) -> _UsbDevice:
         """The one with our serial number; one that does not report its own (no permission, busy) hides no other."""
         chosen: _UsbDevice | None = None
         present: list[str] = []
@@ -291,13 +291,13 @@ class Flap:
         if chosen is not None:
             return chosen
         if denied is not None:  # it may be ours
-            raise self._error(denied, "serial number") from denied
+            raise self._make_error(denied, "serial number") from denied
         others = f"only {', '.join(sorted(present))}" if present else "and no other"
         raise Unreachable(
             self.name, f"no Jrk G2 with serial number {self._settings.serial_number} is connected, {others}"
         )
 
-    def _identity_of(self, device: _UsbDevice) -> Identity:
+    def _read_identity(self, device: _UsbDevice) -> Identity:
         """Its serial number is what it was found by; the version is that of its firmware, binary coded decimal."""
         version = f"{device.bcdDevice >> 8:x}.{device.bcdDevice & 0xFF:02x}"
         model = f"Jrk G2 {_PRODUCTS_JRK_G2[device.idProduct]}"
@@ -315,7 +315,7 @@ class Flap:
             usb.util.dispose_resources(self._device)
         self._device = None
 
-    def _set_target(self, turn: Turn, target: int) -> _Variables:
+    def _set_target(self, turn: MotionCommand, target: int) -> _Variables:
         """Send the target, then clear old errors: in this order the motor never starts towards the old target. All of
         it is idempotent and may be repeated once. The variables are those before the errors were cleared."""
         try:
@@ -323,15 +323,15 @@ class Flap:
         except Unreachable:
             return self._set_target_once(turn, target)
 
-    def _set_target_once(self, turn: Turn, target: int) -> _Variables:
+    def _set_target_once(self, turn: MotionCommand, target: int) -> _Variables:
         device = self._device or self._find()
         self._check_settings(device)
         turn.check()
         self._transfer(device, _TO_DEVICE, _SET_TARGET, target, 0, 0)
         self._commanded = True
-        return self._decoded(self._read(device, _GET_VARIABLES, _CLEAR_HALTING, 0, _VARIABLES_SIZE))
+        return self._decode(self._read(device, _GET_VARIABLES, _CLEAR_HALTING, 0, _VARIABLES_SIZE))
 
-    def _stop_motor(self, turn: Turn) -> None:
+    def _stop_motor(self, turn: MotionCommand) -> None:
         """Idempotent too; the motor of a newer movement is left alone."""
         turn.check()
         self._commanded = False
@@ -340,10 +340,10 @@ class Flap:
         except Unreachable:
             self._transfer(self._device or self._find(), _TO_DEVICE, _STOP_MOTOR, 0, 0, 0)
 
-    def _variables(self) -> _Variables:
-        return self._decoded(self._read(self._device or self._find(), _GET_VARIABLES, 0, 0, _VARIABLES_SIZE))
+    def _read_variables(self) -> _Variables:
+        return self._decode(self._read(self._device or self._find(), _GET_VARIABLES, 0, 0, _VARIABLES_SIZE))
 
-    def _decoded(self, block: bytes) -> _Variables:
+    def _decode(self, block: bytes) -> _Variables:
         """Jrk G2 user's guide, section 12: variables."""
         target, position, duty, halting, current_mA = (
             struct.unpack_from(kind, block, offset)[0]
@@ -365,13 +365,13 @@ class Flap:
             answer = device.ctrl_transfer(request_type, request, value, index, size or None, _TIMEOUT_MS)
         except usb.core.USBError as error:
             self._release()
-            raise self._error(error, f"request 0x{request:02X}") from error
+            raise self._make_error(error, f"request 0x{request:02X}") from error
         data = b"" if isinstance(answer, int) else bytes(answer)
         if len(data) != size:
             raise GarbledReply(self.name, f"request 0x{request:02X} gave {len(data)} of {size} bytes")
         return data
 
-    def _error(self, error: usb.core.USBError, what: str) -> DeviceError:
+    def _make_error(self, error: usb.core.USBError, what: str) -> DeviceError:
         """pyusb's errors by errno, never by text."""
         if error.errno == errno.EPIPE:
             return Refused(self.name, f"the Jrk stalled {what}")
@@ -380,7 +380,7 @@ class Flap:
         return Unreachable(self.name, f"USB: {what} failed ({error})")
 
 
-def _names(halting: int) -> str:
+def _name_errors(halting: int) -> str:
     names = [name for bit, name in enumerate(_ERROR_NAMES) if halting >> bit & 1]
     return ", ".join(names) or "its target was changed by someone else"
 
@@ -425,7 +425,7 @@ class _BackendModule(Protocol):
     def get_backend(self, address: str) -> usb.backend.IBackend: ...
 
 
-def _make(name: str, settings: FlapSettings, around: Around) -> Flap:
+def _make(name: str, settings: FlapSettings, around: DriverContext) -> Flap:
     backend: usb.backend.IBackend | None = None
     if settings.backend is not None and settings.backend_address is not None:
         try:
@@ -454,12 +454,12 @@ def _advise(error: DeviceError, name: str, settings: FlapSettings) -> str:
     return "is something in its way? its counts are of the feedback: compare open_target, closed_target and travel_s"
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Its controller, and where it stands."""
     if look.settings is None:
         look.found("link", "ok", "no flap: cameras see the target all the time")
     else:
-        await look.answers()
+        await look.open_and_read()
 
 
 KIND = DeviceKind(

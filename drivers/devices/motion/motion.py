@@ -10,11 +10,11 @@ from __future__ import annotations
 from thermostand.foundation.errors import Superseded
 
 
-class Turn:
+class MotionCommand:
     """One command's right to move. `aim`: where to, None when no other command can mean the same; `safe`: towards the
     safe state, which is never barred."""
 
-    def __init__(self, motion: Motion, aim: object, safe: bool) -> None:
+    def __init__(self, motion: MotionArbiter, aim: object, safe: bool) -> None:
         self.aim = aim
         self.safe = safe
         self._motion = motion
@@ -25,15 +25,15 @@ class Turn:
             raise Superseded(self._motion.device, "superseded by a newer command or by making safe; not carried out")
 
 
-class Motion:
+class MotionArbiter:
     """The turns of one actuator. Taken, barred and allowed in the event loop only."""
 
     def __init__(self, device: str) -> None:
         self.device = device
-        self.newest: Turn | None = None
+        self.newest: MotionCommand | None = None
         self._barred = False
 
-    def take(self, aim: object = None, *, safe: bool = False) -> Turn:
+    def take(self, aim: object = None, *, safe: bool = False) -> MotionCommand:
         """From now on this command counts; one with the same aim that is under way continues beside it.
 
         Superseded, before anything is sent, when the actuator was made safe and not allowed to move since.
@@ -41,7 +41,7 @@ class Motion:
         if self._barred and not safe:
             raise Superseded(self.device, "it was made safe and has not been allowed to move since; nothing was sent")
         if self.newest is None or aim is None or self.newest.aim != aim:
-            self.newest = Turn(self, aim, safe)
+            self.newest = MotionCommand(self, aim, safe)
         return self.newest
 
     def bar(self) -> None:

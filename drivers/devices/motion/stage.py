@@ -14,17 +14,17 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.kinds import Absence, Around, DeviceKind, LockedPlace, Verb, VerbNumber
-from thermostand.drivers.devices.motion.motion import Motion, Turn
+from thermostand.drivers.devices.kinds import Absence, DeviceKind, DriverContext, LockedPlace, Verb, VerbNumber
+from thermostand.drivers.devices.motion.motion import MotionArbiter, MotionCommand
 from thermostand.drivers.devices.motion.stage_profiles import PROFILES, ProfileName, StageProfile
-from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, Range, same_device
+from thermostand.drivers.settings import Identity, Polled, PollPeriod_s, Range, check_same_device
 from thermostand.drivers.wires.link import SerialSettings, open_link
 from thermostand.drivers.wires.ximc_client import XimcClient
-from thermostand.foundation.addresses import ByteAddress, stated
-from thermostand.foundation.calls import Lane, Result
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.addresses import ByteAddress, get_display_address
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import DeviceAlarm, DeviceError, DeviceFault, GarbledReply, Refused, Unreachable
 from thermostand.foundation.readings import Channel, Quality, Reading
+from thermostand.foundation.workers import Result, WorkerThread
 
 _LINE = SerialSettings(baud=115200, stopbits=2)
 _MICROSTEPS = 256
@@ -109,7 +109,7 @@ class _Status:
         return f"controller alarm, flags 0x{self.flags & _DANGER:08X}" if self.flags & _DANGER else ""
 
     @property
-    def doubt(self) -> str:
+    def position_fault(self) -> str:
         """Why the position must not be relied upon, "" when it may."""
         if self.alarm or not self.homed:
             return self.alarm or _NOT_HOMED
@@ -132,23 +132,23 @@ class Axis:
         self._settings = settings
         self.profile = settings.stage
         self._clock = clock
-        self._lane: Lane | None = None
+        self._worker: WorkerThread | None = None
         self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
         self._speed_steps_s = 1000.0
         self._changed = ""  # what of the controller's settings is not as delivered
-        self._motion = Motion(name)
+        self._motion = MotionArbiter(name)
         self.identity: Identity | None = None  # which controller has answered
         self._zero_due = False  # homing has begun, and its end was not made the zero of the scale yet
 
     async def open(self) -> None:
         """Connect and compare serial number and microstep division; Refused when another controller answers."""
-        if self._lane is None:
-            self._lane = Lane(self.name, self._clock)
+        if self._worker is None:
+            self._worker = WorkerThread(self.name, self._clock)
         await self._call(self._check_identity)
 
     async def close(self) -> None:
         """Let go of the port; may be called twice."""
-        lane, self._lane = self._lane, None
+        lane, self._worker = self._worker, None
         if lane is not None:
             await lane.call(self._client.close)
             lane.close()
@@ -157,17 +157,17 @@ class Axis:
         """(position in mm or deg, moving 0/1, homed 0/1); the position is STALE, with the reason, while the controller
         has an alarm, is not homed, or leaves the motor without current; homed has a reason while the controller is set
         otherwise than its profile says."""
-        status = await self._call(self._status)
+        status = await self._call(self._read_status)
         now_ns = self._clock.now_ns()
         homed = self._is_homed(status)
-        doubt = status.doubt or ("" if homed else _NOT_HOMED)
+        suspicion = status.position_fault or ("" if homed else _NOT_HOMED)
         position = Reading(
             f"{self.name}.position",
-            self._units(status.position),
+            self._to_units(status.position),
             self.profile.unit,
             now_ns,
-            Quality.STALE if doubt else Quality.GOOD,
-            doubt,
+            Quality.STALE if suspicion else Quality.GOOD,
+            suspicion,
             "alarm" if status.alarm else "",
         )
         return (
@@ -178,7 +178,7 @@ class Axis:
 
     async def homed(self) -> bool:
         """Whether the position scale is calibrated."""
-        return self._is_homed(await self._call(self._status))
+        return self._is_homed(await self._call(self._read_status))
 
     async def home(self) -> float:
         """Run the controller's homing procedure and make its end the zero of the scale.
@@ -188,14 +188,14 @@ class Axis:
         """
         turn = self._motion.take()
         await self._call(self._check_identity)  # a power cycle may have brought other settings
-        self._refuse_alarm(await self._call(self._status))
+        self._refuse_alarm(await self._call(self._read_status))
         await self._call(self._begin_homing, turn)
         status = await self._wait(_HOME_LIMIT_S, turn)
         if not (status.homed and status.answers(_COMMAND_HOME)):
             turn.check()
             raise DeviceFault(self.name, "the homing procedure ended without a home position")
-        await self._call(self._zero)
-        return self._units(status.position)
+        await self._call(self._set_zero)
+        return self._to_units(status.position)
 
     async def move_to(self, position: float) -> None:
         """Move to `position` (mm or deg), the last stretch upwards, from where the play has been taken up.
@@ -209,11 +209,11 @@ class Axis:
         if not low <= position <= high:
             raise Refused(self.name, f"{position} {unit} is outside the limits {low}..{high} {unit}")
         turn = self._motion.take()
-        status = await self._call(self._status)
+        status = await self._call(self._read_status)
         self._refuse_alarm(status)
         if not self._is_homed(status):
             raise Refused(self.name, "not homed; its positions mean nothing until it is")
-        target, below = self._microsteps(position), self._microsteps(position - self.profile.overshoot)
+        target, below = self._to_microsteps(position), self._to_microsteps(position - self.profile.overshoot)
         for stop in (below, target) if status.position > below else (target,):
             status = await self._approach(status.position, stop, turn)
 
@@ -235,20 +235,20 @@ class Axis:
     async def _stop(self) -> None:
         for letters in ("sstp", "stop"):
             with contextlib.suppress(DeviceError):  # what counts is whether it stands still
-                await self._call(self._send, letters, b"", _at_rest)
-            if await self._at_rest_within(_STOP_LIMIT_S):
+                await self._call(self._send, letters, b"", _is_at_rest)
+            if await self._wait_for_rest(_STOP_LIMIT_S):
                 return
         raise DeviceFault(self.name, "still moving after a soft and a hard stop")
 
-    async def _at_rest_within(self, limit_s: float) -> bool:
-        deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
-        while (await self._call(self._status)).running:
+    async def _wait_for_rest(self, limit_s: float) -> bool:
+        deadline_ns = self._clock.now_ns() + to_ns(limit_s)
+        while (await self._call(self._read_status)).running:
             if self._clock.now_ns() >= deadline_ns:
                 return False
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(_POLL_S))
         return True
 
-    async def _approach(self, start: int, target: int, turn: Turn) -> _Status:
+    async def _approach(self, start: int, target: int, turn: MotionCommand) -> _Status:
         """One straight move between positions in microsteps; DeviceFault when it ends elsewhere."""
 
         def carried_out(status: _Status) -> bool:
@@ -263,11 +263,11 @@ class Axis:
             raise DeviceFault(self.name, f"stopped{edge} at step {stopped:.2f} instead of {wanted:.2f}")
         return status
 
-    async def _wait(self, limit_s: float, turn: Turn) -> _Status:
+    async def _wait(self, limit_s: float, turn: MotionCommand) -> _Status:
         """Poll until the controller has finished; stop it in an alarm or after `limit_s` of stand time, and say so."""
-        deadline_ns = self._clock.now_ns() + seconds_ns(limit_s)
+        deadline_ns = self._clock.now_ns() + to_ns(limit_s)
         while True:
-            status = await self._call(self._status)
+            status = await self._call(self._read_status)
             if status.running:
                 turn.check()
             if status.alarm or (status.running and self._clock.now_ns() >= deadline_ns):
@@ -278,7 +278,7 @@ class Axis:
                 raise DeviceFault(self.name, f"still moving after {limit_s:.0f} s; stopped")
             if not status.running:
                 return status
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_POLL_S))
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(_POLL_S))
 
     def _is_homed(self, status: _Status) -> bool:
         return status.homed and not self._zero_due
@@ -288,16 +288,16 @@ class Axis:
         if status.alarm:
             raise DeviceAlarm(self.name, f"{status.alarm}; it must be looked into before anything moves")
 
-    def _units(self, position: int) -> float:
+    def _to_units(self, position: int) -> float:
         return position / _MICROSTEPS * self.profile.unit_per_step
 
-    def _microsteps(self, position: float) -> int:
+    def _to_microsteps(self, position: float) -> int:
         return round(position / self.profile.unit_per_step * _MICROSTEPS)
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
-        if self._lane is None:
+        if self._worker is None:
             raise Unreachable(self.name, "not open")
-        return await self._lane.call(function, *args)
+        return await self._worker.call(function, *args)
 
     # Below: in the lane's thread.
 
@@ -314,65 +314,65 @@ class Axis:
         if serial_number != self._settings.serial_number:
             raise Refused(
                 self.name,
-                f"controller {serial_number} answers at {stated(self._settings.address)}, "
+                f"controller {serial_number} answers at {get_display_address(self._settings.address)}, "
                 f"expected {self._settings.serial_number}",
             )
-        self.identity = same_device(self.name, identity_of(self._client, serial_number), self.identity)
+        self.identity = check_same_device(self.name, read_identity(self._client, serial_number), self.identity)
         mode = _ENGINE.unpack(self._client.query("geng", _ENGINE.size))[6]
         if mode != _MICROSTEP_MODE_256:
             raise Refused(self.name, f"microstep mode {mode}, expected {_MICROSTEP_MODE_256} (1/256)")
-        speed = speed_steps_s(self._client)
+        speed = read_speed_steps_s(self._client)
         self._speed_steps_s = max(_LEAST_STEPS_S, speed)
-        self._changed = changed_settings(self.profile, speed, power_off_s(self._client))
+        self._changed = describe_changed_settings(self.profile, speed, read_power_off_s(self._client))
 
-    def _identified(self) -> XimcClient:
+    def _connect_identified(self) -> XimcClient:
         """The client, on a link whose other end has been checked."""
         if not self._client.connected:
             self._check_identity()
         return self._client
 
-    def _status(self) -> _Status:
-        values = _STATUS.unpack(self._identified().query("gets", _STATUS.size))
+    def _read_status(self) -> _Status:
+        values = _STATUS.unpack(self._connect_identified().query("gets", _STATUS.size))
         return _Status(values[1], values[2], values[5] * _MICROSTEPS + values[6], values[15], values[16])
 
     def _send(
-        self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool], turn: Turn | None = None
+        self, letters: str, payload: bytes, carried_out: Callable[[_Status], bool], turn: MotionCommand | None = None
     ) -> None:
         """Send a command, while it is its turn. When its acknowledgement is lost the controller's state shows whether
         it was carried out; only if it was not is it sent a second and last time."""
-        client = self._identified()
+        client = self._connect_identified()
         _check(turn)
         try:
             client.command(letters, payload)
         except (Unreachable, GarbledReply):
-            if not carried_out(self._status()):
+            if not carried_out(self._read_status()):
                 _check(turn)
-                self._identified().command(letters, payload)
+                self._connect_identified().command(letters, payload)
 
-    def _begin_homing(self, turn: Turn) -> None:
+    def _begin_homing(self, turn: MotionCommand) -> None:
         """From here on the scale means nothing until its zero is set, even if the controller reports one."""
-        self._identified()
+        self._connect_identified()
         turn.check()
         self._zero_due = True
         self._send("home", b"", lambda status: status.running and status.answers(_COMMAND_HOME), turn)
 
-    def _zero(self) -> None:
+    def _set_zero(self) -> None:
         """HOME leaves the step counter alone (libximc, command_homezero): zero it, and look whether that came."""
         self._send("zero", b"", lambda status: status.position == 0)
-        if (position := self._status().position) != 0:
+        if (position := self._read_status().position) != 0:
             raise DeviceFault(
                 self.name, f"the step counter could not be set to zero, it is {position / _MICROSTEPS:.2f}"
             )
         self._zero_due = False
 
 
-def _check(turn: Turn | None) -> None:
+def _check(turn: MotionCommand | None) -> None:
     """A stop needs no turn."""
     if turn is not None:
         turn.check()
 
 
-def _at_rest(status: _Status) -> bool:
+def _is_at_rest(status: _Status) -> bool:
     return not status.running
 
 
@@ -381,21 +381,21 @@ _FIRMWARE = struct.Struct("<BBH")  # GFWV: major, minor, release
 _MADE = struct.Struct("<4s2s8sBBH12x")  # GETI: manufacturer, its id, product, version of the hardware
 
 
-def identity_of(client: XimcClient, serial_number: int) -> Identity:
+def read_identity(client: XimcClient, serial_number: int) -> Identity:
     """Blocking; a controller whose firmware does not know a request does not tell that. Unreachable, GarbledReply."""
     try:
         maker, _, product, *_ = _MADE.unpack(client.query("geti", _MADE.size))
         version = ".".join(map(str, _FIRMWARE.unpack(client.query("gfwv", _FIRMWARE.size))))
     except Refused:
         return Identity("Standa", "XIMC", str(serial_number), "", by_map=True)
-    return Identity(_text(maker), _text(product), str(serial_number), version)
+    return Identity(_decode_text(maker), _decode_text(product), str(serial_number), version)
 
 
 _POWER = struct.Struct("<BHHHB6x")  # GPWR: HoldCurrent, CurrReductDelay, PowerOffDelay, CurrentSetTime, PowerFlags
 _POWER_OFF_ENABLED = 0x2
 
 
-def power_off_s(client: XimcClient) -> float | None:
+def read_power_off_s(client: XimcClient) -> float | None:
     """After how long at rest it switches its motor off, None for never; blocking. Unreachable, GarbledReply."""
     _, _, delay_s, _, flags = _POWER.unpack(client.query("gpwr", _POWER.size))
     return float(delay_s) if flags & _POWER_OFF_ENABLED else None
@@ -405,32 +405,32 @@ _MOVE = struct.Struct("<IBHHIBB9x")  # Speed, uSpeed, Accel, Decel, AntiplaySpee
 _THOUSANDTHS = 0x1  # of MoveFlags: the speeds are divided by 1000
 
 
-def speed_steps_s(client: XimcClient) -> float:
+def read_speed_steps_s(client: XimcClient) -> float:
     """At which it moves, full steps/s; blocking. Unreachable, GarbledReply."""
     speed, *_, flags = _MOVE.unpack(client.query("gmov", _MOVE.size))
     return speed / 1000 if flags & _THOUSANDTHS else float(speed)
 
 
-def changed_settings(profile: StageProfile, speed: float, power_off: float | None) -> str:
+def describe_changed_settings(profile: StageProfile, speed: float, power_off: float | None) -> str:
     """What somebody else has changed, in words; "" when all is as the profile says."""
     pairs = (("speed", speed, profile.speed, "steps/s"), ("power-off delay", power_off, profile.power_off_s, "s"))
     return "; ".join(
-        f"{what} {_said(is_, unit)}, not {_said(wanted, unit)} as in its profile"
+        f"{what} {_format_value(is_, unit)}, not {_format_value(wanted, unit)} as in its profile"
         for what, is_, wanted, unit in pairs
         if is_ != wanted
     )
 
 
-def _said(value: float | None, unit: str) -> str:
+def _format_value(value: float | None, unit: str) -> str:
     return "none" if value is None else f"{value:g} {unit}"
 
 
-def _text(field: bytes) -> str:
+def _decode_text(field: bytes) -> str:
     """What is printable of a text field that is filled up with zeros."""
     return "".join(each for each in field.partition(b"\0")[0].decode("latin-1") if each.isprintable()).strip()
 
 
-def _make(name: str, settings: AxisSettings, around: Around) -> Axis:
+def _make(name: str, settings: AxisSettings, around: DriverContext) -> Axis:
     return Axis(name, settings, around.clock)
 
 

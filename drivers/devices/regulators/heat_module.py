@@ -12,13 +12,13 @@ from typing import NoReturn, Self
 
 from pydantic import Field, model_validator
 
-from thermostand.drivers.devices.checking import DeviceLook
+from thermostand.drivers.devices.device_check import DeviceCheck
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.kinds import Around, DeviceKind
+from thermostand.drivers.devices.kinds import DeviceKind, DriverContext
 from thermostand.drivers.devices.relays import COIL_OFF, COIL_ON
 from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.modbus_unit import ModbusUnit
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault, Refused, Unreachable
 from thermostand.foundation.readings import Channel, Quality, Reading
 
@@ -108,15 +108,15 @@ class HeatModule:
             # While it heats only the law speaks to the module: a poll would refresh the watchdog of a law that has
             # died.
             if self._armed_ns is not None and self._last:
-                return self._exchanged()
-            await self._make_sure()
-            given_mA = await self._given_mA()
+                return self._exchange()
+            await self._verify_identity()
+            given_mA = await self._read_output_mA()
             if given_mA > self._settings.zero_mA + _TOLERANCE_mA:
-                await self._zero()
+                await self._set_zero()
                 raise DeviceFault(self.name, f"gave {given_mA:.2f} mA unasked; it is at its zero again")
             return self._last
 
-    def _exchanged(self) -> tuple[Reading, ...]:
+    def _exchange(self) -> tuple[Reading, ...]:
         age_s = (self._clock.now_ns() - self._last[0].time_ns) / NS_PER_S
         reason = self._unread
         if not reason and age_s > self._settings.watchdog_s:
@@ -133,10 +133,10 @@ class HeatModule:
             await self._prepare()
             await self._unit.write(_TIME, self._settings.watchdog_s)
             await self._switch(_WATCHDOG, True)
-            if await self._is(_TRIPPED):
+            if await self._read_coil(_TRIPPED):
                 await self._clear()
-            await self._zero()
-            if await self._is(_TRIPPED):
+            await self._set_zero()
+            if await self._read_coil(_TRIPPED):
                 raise DeviceFault(self.name, "its host watchdog trips as soon as it is cleared")
             self._armed_ns = self._checked_ns = self._clock.now_ns()
             self._trip, self._differed, self.uncontrolled = "", False, ""
@@ -150,7 +150,7 @@ class HeatModule:
                 raise DeviceFault(self.name, "gives no heat: it was not armed")
             if self._trip:
                 raise DeviceFault(self.name, self._trip)
-            await self._make_sure()
+            await self._verify_identity()
             await self._compare()
             await self._check_dead_man()
             settings = self._settings
@@ -166,7 +166,7 @@ class HeatModule:
         """No heat, confirmed; DeviceError. Its watchdog is off from then, unless it cannot be reached for that: then it
         trips, which is as safe."""
         async with self._exclusive:
-            await self._zero()
+            await self._set_zero()
             self.uncontrolled = ""
             with suppress(DeviceError):
                 # On while nothing is given, it would trip in every idle hour.
@@ -179,7 +179,7 @@ class HeatModule:
         await self.arm()
         try:
             await self._pause(_TESTED)
-            if not await self._is(_TRIPPED):
+            if not await self._read_coil(_TRIPPED):
                 text = f"its host watchdog does not trip after {_TESTED * self._settings.watchdog_s:g} s without us"
                 raise DeviceFault(self.name, f"{text}; it would heat on when this computer has died")
             await self.arm()
@@ -194,7 +194,7 @@ class HeatModule:
         finally:
             await self.off()
 
-    async def _make_sure(self) -> None:
+    async def _verify_identity(self) -> None:
         """That it is the module that answered before, or it gets no heat; off is never withheld."""
         # Also after each loss of the line: a module that was exchanged in mid-run must not be heated with.
         if not self._exclusive.is_known:
@@ -202,7 +202,7 @@ class HeatModule:
             self._exclusive.is_known = True
 
     async def _pause(self, share: float) -> None:
-        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(share * self._settings.watchdog_s))
+        await self._clock.sleep_until(self._clock.now_ns() + to_ns(share * self._settings.watchdog_s))
 
     async def _prepare(self) -> None:
         self._is_safe = False
@@ -214,10 +214,10 @@ class HeatModule:
                 text = f"{self._type_code} is {sample.raw:#x}, which is no range of mA; set its range at the module"
                 raise DeviceFault(self.name, text)
         for point, when in ((self._safe, "when it is left alone"), (self._power_on, "after power-up")):
-            await self._make(point, when)
+            await self._write_setting(point, when)
         self._is_safe = True
 
-    async def _make(self, point: str, when: str) -> None:
+    async def _write_setting(self, point: str, when: str) -> None:
         """The value as configured, which is written only when it differs: it wears the module's memory."""
         wanted_mA = self._settings.tripped_mA
         if abs(await self._mA(point) - wanted_mA) <= _TOLERANCE_mA:
@@ -232,7 +232,7 @@ class HeatModule:
     async def _compare(self) -> None:
         """What it gives with what it was left at; the trip lasts."""
         age_s = (self._clock.now_ns() - (self._armed_ns or 0)) / NS_PER_S
-        given_mA = await self._given_mA()
+        given_mA = await self._read_output_mA()
         if self._last[-1].value == 1:
             self._trip = (
                 f"its host watchdog has tripped ({age_s:.1f} s after it was last written to): it gives {given_mA:.2f} "
@@ -251,22 +251,22 @@ class HeatModule:
         after two tries, or that is_again so though it was, is not controlled any more."""
         try:
             try:
-                await self._zero()
+                await self._set_zero()
             except DeviceFault:
-                await self._zero()
+                await self._set_zero()
         except DeviceFault as error:
-            self._lose(f"{text}; it {error.text}")
+            self._raise_fault(f"{text}; it {error.text}")
         if is_again:
-            self._lose(text)
+            self._raise_fault(text)
         raise DeviceFault(self.name, text)
 
-    def _lose(self, text: str) -> NoReturn:
+    def _raise_fault(self, text: str) -> NoReturn:
         self._trip = self.uncontrolled = text
         raise DeviceFault(self.name, text)
 
     async def _check_dead_man(self) -> None:
         """Now and then: would it still end the heat when this program dies, as when it was armed?"""
-        if self._clock.now_ns() - self._checked_ns < seconds_ns(_CHECKED_EVERY_S):
+        if self._clock.now_ns() - self._checked_ns < to_ns(_CHECKED_EVERY_S):
             return
         settings, found = self._settings, await self._unit.snapshot([_WATCHDOG, _TIME, self._safe])
         safe_mA, watchdog_s = (found.samples[point].value for point in (self._safe, _TIME))
@@ -276,13 +276,13 @@ class HeatModule:
             (not abs(safe_mA - settings.tripped_mA) <= _TOLERANCE_mA, f"it gives {safe_mA:g} mA when it is left alone"),
         ]
         if changed := [text for is_so, text in changes if is_so]:
-            await self._zero()
+            await self._set_zero()
             text = "; somebody has changed that: it gives no heat until control is started again"
             self._trip = f"{', '.join(changed)}{text}"
             raise DeviceFault(self.name, self._trip)
         self._checked_ns = self._clock.now_ns()
 
-    async def _zero(self) -> None:
+    async def _set_zero(self) -> None:
         """Confirmed by what it gives; a module that has tripped takes nothing, and gives its safe value."""
         zero_mA, error = self._settings.zero_mA, ""
         try:
@@ -291,14 +291,14 @@ class HeatModule:
             raise
         except DeviceError as failure:
             error = f" ({failure.text})"
-        given_mA = await self._given_mA()
+        given_mA = await self._read_output_mA()
         is_tripped = self._last[-1].value == 1
         is_low = given_mA <= zero_mA + _TOLERANCE_mA
         if is_low if self._present != self._output or not is_tripped else self._is_safe:
             return
         raise DeviceFault(self.name, f"is not confirmed at {zero_mA:g} mA, it gives {given_mA:.2f} mA{error}")
 
-    async def _given_mA(self) -> float:
+    async def _read_output_mA(self) -> float:
         """What flows, mA, and whether it has tripped, which become the readings."""
         try:
             snapshot = await self._unit.snapshot([self._present, _TRIPPED])
@@ -321,7 +321,7 @@ class HeatModule:
             raise DeviceFault(self.name, f"{point}: {sample.reason}")
         return sample.value
 
-    async def _is(self, coil: str) -> bool:
+    async def _read_coil(self, coil: str) -> bool:
         return (await self._unit.snapshot([coil])).bits[coil]
 
     async def _clear(self) -> None:
@@ -329,31 +329,31 @@ class HeatModule:
             await self._unit.write_coil(self._unit.map.points[_TRIPPED].address, COIL_ON)
 
         async def holds() -> bool:
-            return not await self._is(_TRIPPED)
+            return not await self._read_coil(_TRIPPED)
 
-        await self._unit.checked(send, holds, "clearing the trip")
+        await self._unit.send_and_check(send, holds, "clearing the trip")
 
     async def _switch(self, coil: str, on: bool) -> None:
         async def send() -> None:
             await self._unit.write_coil(self._unit.map.points[coil].address, COIL_ON if on else COIL_OFF)
 
         async def holds() -> bool:
-            return await self._is(coil) == on
+            return await self._read_coil(coil) == on
 
-        await self._unit.checked(send, holds, f"{coil} {'on' if on else 'off'}")
+        await self._unit.send_and_check(send, holds, f"{coil} {'on' if on else 'off'}")
 
 
-def _make(name: str, settings: HeatModuleSettings, around: Around) -> HeatModule:
+def _make(name: str, settings: HeatModuleSettings, around: DriverContext) -> HeatModule:
     unit = ModbusUnit(name, around.bus, around.map_of("heat_module", settings))
     return HeatModule(unit, settings, around.clock)
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Opened as a run does it."""
-    await look.answers()
+    await look.open_and_read()
     places = ("output", "present", "safe", "power_on", "type_code")
     watchdog = ("watchdog_mode", _WATCHDOG, _TIME, _TRIPPED, "data_format")
-    await look.points((*(f"{each}_{look.settings.channel}" for each in places), *watchdog))
+    await look.check_points((*(f"{each}_{look.settings.channel}" for each in places), *watchdog))
 
 
 KIND = DeviceKind(

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from thermostand.drivers.devices.protocols import Switches
 from thermostand.drivers.devices.relays import HEAT
-from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, to_ns
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import DeviceFault, Refused
 
@@ -36,10 +36,10 @@ class PulsesSettings(Document):
         return self
 
 
-def pulse_s(percent: float, owed_s: float, settings: PulsesSettings) -> tuple[float, float]:
+def compute_pulse_s(percent: float, carry_s: float, settings: PulsesSettings) -> tuple[float, float]:
     """How long the relay is on in the coming cycle (cycle_s: all of it), and what is then owed (s, less than 0 when too
     much was given): what was rounded, or left out, of the output's share."""
-    wanted_s = percent / 100 * settings.cycle_s + owed_s
+    wanted_s = percent / 100 * settings.cycle_s + carry_s
     given_s = round(min(settings.cycle_s, max(0.0, wanted_s)) / _STEP_S) * _STEP_S
     if given_s < settings.min_on_s:
         given_s = 0.0
@@ -59,7 +59,7 @@ class HeatPulses:
         self._board = board
         self._settings = settings
         self._clock = clock
-        self._owed_s = 0.0
+        self._carry_s = 0.0
         self._due_ns = 0
         self._until_ns = 0  # when the relay drops by itself
         self._is_compared = False  # whether what it is left as is known
@@ -80,11 +80,11 @@ class HeatPulses:
         now_ns = self._clock.now_ns()
         if not at_once and now_ns < self._due_ns:
             return
-        cycle_ns = seconds_ns(self._settings.cycle_s)
+        cycle_ns = to_ns(self._settings.cycle_s)
         late = at_once or now_ns - self._due_ns > cycle_ns
         self._due_ns = (now_ns if late else self._due_ns) + cycle_ns
         await self._compare(now_ns)
-        on_s, self._owed_s = pulse_s(percent, self._owed_s, self._settings) if percent > 0 else (0.0, 0.0)
+        on_s, self._carry_s = compute_pulse_s(percent, self._carry_s, self._settings) if percent > 0 else (0.0, 0.0)
         if on_s <= 0:
             if now_ns < self._until_ns:
                 await self._off()
@@ -92,11 +92,11 @@ class HeatPulses:
         hold_s = on_s + (_OVERLAP_S if on_s >= self._settings.cycle_s else 0.0)
         self._is_compared = False  # until the command is confirmed
         await self._board.hold_on(HEAT, hold_s)
-        self._until_ns, self._is_compared = self._clock.now_ns() + seconds_ns(hold_s), True
+        self._until_ns, self._is_compared = self._clock.now_ns() + to_ns(hold_s), True
 
     async def off(self) -> None:
         """No heat, confirmed; DeviceError."""
-        self._due_ns, self._owed_s = 0, 0.0
+        self._due_ns, self._carry_s = 0, 0.0
         await self._off()
 
     async def _off(self) -> None:

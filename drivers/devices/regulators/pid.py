@@ -65,7 +65,7 @@ def start(law: Law, measured_degC: float, output_percent: float) -> State:
     return State(measured_degC, output_percent - proportional, 0.0, weighed_K)
 
 
-def continued(law: Law, state: State, measured_degC: float) -> State:
+def continue_after_gap(law: Law, state: State, measured_degC: float) -> State:
     """After a gap in the measurements: the integral as it was, and no kick by the derivative."""
     weighed_K = measured_degC - law.derivative_set_point_weight * state.set_point_degC
     return replace(state, derivative_percent=0.0, weighed_K=weighed_K)
@@ -73,12 +73,12 @@ def continued(law: Law, state: State, measured_degC: float) -> State:
 
 def step(law: Law, state: State, asked_degC: float, measured_degC: float, h_s: float) -> tuple[float, State]:
     """The output (%) until the next step, and the next state; h_s: since the step before."""
-    wanted_degC = _approached(law, state.set_point_degC, asked_degC, h_s)
-    demand, derivative = _demand(law, state, state.set_point_degC, measured_degC, h_s)
+    wanted_degC = _approach(law, state.set_point_degC, asked_degC, h_s)
+    demand, derivative = _compute_demand(law, state, state.set_point_degC, measured_degC, h_s)
     pushes = wanted_degC - state.set_point_degC
     held = (pushes > 0 and demand >= law.highest_percent) or (pushes < 0 and demand <= law.lowest_percent)
     r_degC = state.set_point_degC if held else wanted_degC
-    demand, derivative = _demand(law, state, r_degC, measured_degC, h_s)
+    demand, derivative = _compute_demand(law, state, r_degC, measured_degC, h_s)
     output = min(law.highest_percent, max(law.lowest_percent, demand))
     integral = state.integral_percent + law.gain_percent_per_K * h_s / law.integral_s * (r_degC - measured_degC)
     integral += min(1.0, h_s / _tracking_s(law)) * (output - demand)
@@ -93,7 +93,7 @@ def split(output_percent: float, dead_band_percent: float) -> tuple[float, float
     return (beyond, 0.0) if output_percent > 0 else (0.0, beyond)
 
 
-def _demand(law: Law, state: State, r_degC: float, y_degC: float, h_s: float) -> tuple[float, float]:
+def _compute_demand(law: Law, state: State, r_degC: float, y_degC: float, h_s: float) -> tuple[float, float]:
     """v and D of the formula at the top."""
     K, Td, N = law.gain_percent_per_K, law.derivative_s, law.derivative_filter
     change_K = y_degC - law.derivative_set_point_weight * r_degC - state.weighed_K
@@ -105,7 +105,7 @@ def _tracking_s(law: Law) -> float:
     return law.tracking_s or math.sqrt(law.integral_s * law.derivative_s) or law.integral_s
 
 
-def _approached(law: Law, from_degC: float, to_degC: float, h_s: float) -> float:
+def _approach(law: Law, from_degC: float, to_degC: float, h_s: float) -> float:
     way_K = to_degC - from_degC
     if law.approach_s is not None:
         way_K *= -math.expm1(-h_s / law.approach_s)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from thermostand.drivers.devices.checking import check_controller
+from thermostand.drivers.devices.device_check import check_controller
 from thermostand.drivers.devices.exclusive import Exclusive
-from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, Around, DeviceKind, MapOf, OfSection
+from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, DeviceKind, DriverContext, MapOf, OfSection
 from thermostand.drivers.devices.protocols import InForce
 from thermostand.drivers.settings import Identity, OnBus
 from thermostand.drivers.wires.bus import Bus
-from thermostand.drivers.wires.modbus_unit import CONFIRM_LOOKS, ModbusUnit, Sample, Snapshot, is_confirmed, objection
+from thermostand.drivers.wires.modbus_unit import (
+    CONFIRM_LOOKS,
+    ModbusUnit,
+    Sample,
+    Snapshot,
+    find_objection,
+    is_confirmed,
+)
 from thermostand.drivers.wires.registers import RegisterMap
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import ConfigError, DeviceFault, Occupied, Refused
 from thermostand.foundation.readings import Channel, Reading, bad_reading
 
@@ -82,7 +89,7 @@ class Regulator:
             if self._clock.now_ns() >= self._probe_ns:
                 await self._probe()
             snapshot = await self._unit.snapshot(self._map.polled())
-            if not self._ready(snapshot):
+            if not self._is_ready(snapshot):
                 await self._start_up()
                 snapshot = await self._unit.snapshot(self._map.polled())
             readings = self._readings(snapshot)
@@ -107,7 +114,7 @@ class Regulator:
         async with self._exclusive:
             await self._ensure_started()
             status = await self._unit.snapshot(self._status)
-            if not self._ready(status):
+            if not self._is_ready(status):
                 await self._start_up()
             if status.bits.get(AUTOTUNE):
                 raise Occupied(self.name, "autotuning is active; no set point was sent")
@@ -147,18 +154,18 @@ class Regulator:
             for check in asked
             if not check.follows
             or (are_followed and not (self._map.points[check.follows].refresh and self._sp_degC is None))
-            if (text := objection(check, snapshot))
+            if (text := find_objection(check, snapshot))
         )
 
     async def stop(self) -> None:
         """Stop control, confirmed; the outputs go to the unit's "MV at stop"."""
-        await self._force(("stop",))
+        await self._send_at_once(("stop",))
 
     async def make_safe(self) -> None:
         """The map's safe state (stop), confirmed."""
-        await self._force(self._map.safe_state)
+        await self._send_at_once(self._map.safe_state)
 
-    async def _force(self, commands: tuple[str, ...]) -> None:
+    async def _send_at_once(self, commands: tuple[str, ...]) -> None:
         """Send commands at once, also to a unit that has been power-cycled and refuses writing at first."""
         async with self._exclusive:
             try:
@@ -190,13 +197,13 @@ class Regulator:
     async def _probe(self) -> None:
         """The decimal point above all: a constant that also exposes a reply that is not the unit's."""
         await self._unit.probe()
-        self._probe_ns = self._clock.now_ns() + seconds_ns(PROBE_PERIOD_S)
+        self._probe_ns = self._clock.now_ns() + to_ns(PROBE_PERIOD_S)
 
     async def _commands(self, names: tuple[str, ...]) -> None:
         for name in names:
             await self._unit.command(name)
 
-    def _ready(self, snapshot: Snapshot) -> bool:
+    def _is_ready(self, snapshot: Snapshot) -> bool:
         return all(is_confirmed(self._map.commands[name], snapshot) for name in self._map.startup)
 
     def _readings(self, snapshot: Snapshot) -> tuple[Reading, ...]:
@@ -221,7 +228,7 @@ class Regulator:
         return Reading(channel, sample.value, quantity.unit, now_ns)
 
 
-def _make(name: str, settings: OnBus, around: Around) -> Regulator:
+def _make(name: str, settings: OnBus, around: DriverContext) -> Regulator:
     return Regulator(name, around.bus, around.map_of("regulator", settings), around.clock)
 
 

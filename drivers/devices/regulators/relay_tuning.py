@@ -61,7 +61,7 @@ class Period:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class UltimatePoint:
     """What the limit cycle has shown."""
 
     ultimate_gain_percent_per_K: float
@@ -109,7 +109,7 @@ def step(tuning: Tuning, measured_degC: float, now_ns: int, settings: TuningSett
         tuning,
         lowest_degC=min(tuning.lowest_degC, measured_degC),
         highest_degC=max(tuning.highest_degC, measured_degC),
-        failure=_failure(tuning, measured_degC, now_ns, settings, law),
+        failure=_explain_failure(tuning, measured_degC, now_ns, settings, law),
     )
     above_K = measured_degC - tuning.set_point_degC
     if seen.failure:
@@ -117,11 +117,11 @@ def step(tuning: Tuning, measured_degC: float, now_ns: int, settings: TuningSett
     if tuning.is_high and above_K > settings.hysteresis_K:
         return replace(seen, is_high=False, fell_ns=now_ns)
     if not tuning.is_high and above_K < -settings.hysteresis_K:
-        return _rise(seen, now_ns, settings, law)
+        return _begin_upper_level(seen, now_ns, settings, law)
     return seen
 
 
-def found(tuning: Tuning, settings: TuningSettings) -> Found | None:
+def find_ultimate_point(tuning: Tuning, settings: TuningSettings) -> UltimatePoint | None:
     """The ultimate point, once the last periods agree."""
     last = tuning.periods[-_PERIODS:]
     if len(last) < _PERIODS or not all(abs(2 * each.share - 1) <= 2 * _AGREE for each in last):
@@ -135,10 +135,10 @@ def found(tuning: Tuning, settings: TuningSettings) -> Found | None:
         return None
     output = sum(each.amplitude_percent * math.sin(math.pi * each.share) for each in last) / len(last)
     gain = 4 * output / (math.pi * math.sqrt(amplitude_K**2 - settings.hysteresis_K**2))
-    return Found(gain, period_s, amplitude_K, output)
+    return UltimatePoint(gain, period_s, amplitude_K, output)
 
 
-def tuned(law: Law, point: Found) -> Law:
+def tune(law: Law, point: UltimatePoint) -> Law:
     """The law with the constants of the rule at the top; its limits stay."""
     Ku, Tu = point.ultimate_gain_percent_per_K, point.ultimate_period_s
     changes = {
@@ -151,7 +151,7 @@ def tuned(law: Law, point: Found) -> Law:
     return law.model_copy(update=changes)
 
 
-def _rise(tuning: Tuning, now_ns: int, settings: TuningSettings, law: Law) -> Tuning:
+def _begin_upper_level(tuning: Tuning, now_ns: int, settings: TuningSettings, law: Law) -> Tuning:
     """The upper level begins: with it a period ends, and the bias goes towards even shares."""
     fresh = replace(tuning, is_high=True, rose_ns=now_ns, lowest_degC=math.inf, highest_degC=-math.inf)
     if tuning.rose_ns is None or tuning.fell_ns is None:
@@ -164,7 +164,7 @@ def _rise(tuning: Tuning, now_ns: int, settings: TuningSettings, law: Law) -> Tu
     return replace(fresh, bias_percent=bias, periods=(*tuning.periods, period))
 
 
-def _failure(tuning: Tuning, measured_degC: float, now_ns: int, settings: TuningSettings, law: Law) -> str:
+def _explain_failure(tuning: Tuning, measured_degC: float, now_ns: int, settings: TuningSettings, law: Law) -> str:
     at = f"at {tuning.set_point_degC:g} degC"
     if abs(measured_degC - tuning.set_point_degC) > settings.limit_K:
         return f"{measured_degC:.1f} degC is more than {settings.limit_K:g} K from the set-point; is anything open?"
@@ -178,7 +178,7 @@ def _failure(tuning: Tuning, measured_degC: float, now_ns: int, settings: Tuning
     return ""
 
 
-def as_yaml(law: Law) -> str:
+def format_yaml(law: Law) -> str:
     """One line for the `regulator` section of a stand's file, without what is as by default."""
     values = ", ".join(f"{name}: {value:g}" for name, value in law.model_dump(exclude_defaults=True).items())
     return f"law: {{{values}}}"

@@ -15,22 +15,30 @@ from typing import Literal, cast
 
 from pydantic import Field
 
-from thermostand.drivers.devices.checking import DeviceLook
-from thermostand.drivers.devices.kinds import CONTROL, CONTROLLED, Arguments, Around, DeviceKind, Hands, Verb
+from thermostand.drivers.devices.device_check import DeviceCheck
+from thermostand.drivers.devices.kinds import (
+    CONTROL,
+    CONTROLLED,
+    Arguments,
+    DeviceKind,
+    DriverContext,
+    ManualActions,
+    Verb,
+)
 from thermostand.drivers.devices.protocols import HeatOutput, InForce, Switches
 from thermostand.drivers.devices.regulators import pid, relay_tuning
 from thermostand.drivers.devices.regulators.heat_module import HeatModule
 from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings
 from thermostand.drivers.devices.regulators.pid import Law
-from thermostand.drivers.devices.regulators.relay_tuning import Found, Tuning, TuningSettings
+from thermostand.drivers.devices.regulators.relay_tuning import Tuning, TuningSettings, UltimatePoint
 from thermostand.drivers.devices.relays import HEAT
 from thermostand.drivers.settings import DeviceName, Identity, Polled
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.errors import DeviceError, DeviceFault, Occupied, Refused
 from thermostand.foundation.events import AUTOTUNED
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Channel, Quality, Reading, bad_reading
-from thermostand.foundation.tasks import cancelled, failure_text
+from thermostand.foundation.tasks import cancel_all, describe_failure
 
 _REST_K, _REST_S = 0.5, 600.0  # how near, and for how long, the set-point is held before it is tuned about
 
@@ -67,10 +75,10 @@ class SoftwareRegulator:
         publish: Callable[[Item], None],
     ) -> None:
         self.name = name
-        self.permitted: Callable[[], bool] = lambda: False
+        self.is_permitted: Callable[[], bool] = lambda: False
         self._settings = settings
         self._heat = heat
-        self._measured = measured
+        self._get_measurement = measured
         self._allowed_degC = allowed_degC
         self._stale_s = stale_s
         self._clock = clock
@@ -105,15 +113,15 @@ class SoftwareRegulator:
     async def read(self) -> tuple[Reading, ...]:
         """pv, sp (degC; BAD before one was given), mv_heat, mv_cool (%), running, fault."""
         now_ns, sp = self._clock.now_ns(), f"{self.name}.sp"
-        _, reason = self._pv(now_ns)
+        _, reason = self._get_process_value(now_ns)
         if self._task is not None and self._task.done() and not self._task.cancelled():
             error = self._task.exception()
-            self._trouble = f"control has ended: {failure_text(error)}" if error is not None else self._trouble
+            self._trouble = f"control has ended: {describe_failure(error)}" if error is not None else self._trouble
         running = self._task is not None and not self._task.done()
         faults = [text for text in (self._trouble, reason if running else "") if text]
         heat, cool = pid.split(self._output_percent if running else 0.0, self._settings.law.dead_band_percent)
         return (
-            self._shown(now_ns),
+            self._get_shown_value(now_ns),
             bad_reading(sp, "degC", now_ns, "none was given yet")
             if self._sp_degC is None
             else Reading(sp, self._sp_degC, "degC", now_ns),
@@ -165,32 +173,32 @@ class SoftwareRegulator:
         that was found is event `autotuned`; DeviceFault when none was."""
         if self._tuning is not None:
             raise Occupied(self.name, "autotuning is active already")
-        await self._rested()
+        await self._wait_for_rest()
         sp_degC, output_percent = self._sp_degC or 0.0, self._output_percent
         try:
-            point = await self._cycled(relay_tuning.begin(sp_degC, output_percent, self._clock.now_ns()))
+            point = await self._run_limit_cycle(relay_tuning.begin(sp_degC, output_percent, self._clock.now_ns()))
         finally:
             self._tuning = None
-            pv, _ = self._pv(self._clock.now_ns())
+            pv, _ = self._get_process_value(self._clock.now_ns())
             self._state = None if pv is None else pid.start(self._settings.law, pv.value, output_percent)
-        law = relay_tuning.tuned(self._settings.law, point)
+        law = relay_tuning.tune(self._settings.law, point)
         data = {"device": self.name, "set_point_degC": sp_degC, **asdict(point), "law": law.model_dump(mode="json")}
-        self._publish(AUTOTUNED.at(self._clock.now_ns(), relay_tuning.as_yaml(law), **data))
+        self._publish(AUTOTUNED.at(self._clock.now_ns(), relay_tuning.format_yaml(law), **data))
         return law
 
-    async def _rested(self) -> None:
+    async def _wait_for_rest(self) -> None:
         """Until the set-point has been held for a while."""
         since_ns = self._clock.now_ns()
-        while self._rests_ns is None or self._clock.now_ns() - self._rests_ns < seconds_ns(_REST_S):
+        while self._rests_ns is None or self._clock.now_ns() - self._rests_ns < to_ns(_REST_S):
             self._check_controls()
-            if self._clock.now_ns() - since_ns > seconds_ns(self._settings.autotune.limit_s):
+            if self._clock.now_ns() - since_ns > to_ns(self._settings.autotune.limit_s):
                 text = f"not tuned: its set-point was not held within {_REST_K:g} K for {_REST_S:g} s"
                 raise DeviceFault(self.name, text)
             await self._pause()
 
-    async def _cycled(self, tuning: Tuning) -> Found:
+    async def _run_limit_cycle(self, tuning: Tuning) -> UltimatePoint:
         """What the limit cycle shows, once it is even."""
-        while (point := relay_tuning.found(tuning, self._settings.autotune)) is None:
+        while (point := relay_tuning.find_ultimate_point(tuning, self._settings.autotune)) is None:
             self._check_controls()
             if tuning.failure:
                 raise DeviceFault(self.name, f"not tuned: {tuning.failure}")
@@ -210,16 +218,16 @@ class SoftwareRegulator:
                     self._trouble = ""
                 except DeviceError as error:
                     self._trouble = str(error)
-                due_ns = max(due_ns + seconds_ns(self._settings.sample_s), self._clock.now_ns())
+                due_ns = max(due_ns + to_ns(self._settings.sample_s), self._clock.now_ns())
                 await self._clock.sleep_until(due_ns)
         finally:
             self._output_percent, self._stepped_ns = 0.0, 0
 
     async def _tick(self) -> None:
         now_ns = self._clock.now_ns()
-        pv, _ = self._pv(now_ns)
+        pv, _ = self._get_process_value(now_ns)
         was_high = self._tuning is not None and self._tuning.is_high
-        if pv is None or not self.permitted():
+        if pv is None or not self.is_permitted():
             self._output_percent, self._stepped_ns, self._rests_ns = 0.0, 0, None
         elif pv.time_ns != self._stepped_ns:
             self._output_percent = self._step(pv, now_ns)
@@ -242,7 +250,7 @@ class SoftwareRegulator:
         if self._state is None:
             self._state = pid.start(law, pv.value, 0.0)
         elif not self._stepped_ns:
-            self._state = pid.continued(law, self._state, pv.value)
+            self._state = pid.continue_after_gap(law, self._state, pv.value)
         self._stepped_ns = pv.time_ns
         output_percent, self._state = pid.step(law, self._state, sp_degC, pv.value, h_s)
         return output_percent
@@ -250,36 +258,36 @@ class SoftwareRegulator:
     async def _end(self) -> None:
         task, self._task = self._task, None
         if task is not None:
-            await cancelled([task])
+            await cancel_all([task])
 
-    def _pv(self, now_ns: int) -> tuple[Reading | None, str]:
+    def _get_process_value(self, now_ns: int) -> tuple[Reading | None, str]:
         """A reading that may be acted upon, or why there is none."""
-        reading, channel = self._measured(), f"thermometers.{self._settings.thermometer}"
+        reading, channel = self._get_measurement(), f"thermometers.{self._settings.thermometer}"
         if reading is None:
             return None, f"{channel} was not read yet"
         if reading.quality is not Quality.GOOD:
             return None, f"{channel} is {reading.quality}: {reading.reason}"
-        if now_ns - reading.time_ns > seconds_ns(self._stale_s):
+        if now_ns - reading.time_ns > to_ns(self._stale_s):
             return None, f"{channel} is {(now_ns - reading.time_ns) / NS_PER_S:.0f} s old"
         return reading, ""
 
     def _check_controls(self) -> None:
         """DeviceFault when there is nothing to be tuned any more."""
-        if self._task is None or self._task.done() or not self.permitted():
+        if self._task is None or self._task.done() or not self.is_permitted():
             raise DeviceFault(self.name, "not tuned: control was stopped")
 
     async def _pause(self) -> None:
-        await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(self._settings.sample_s))
+        await self._clock.sleep_until(self._clock.now_ns() + to_ns(self._settings.sample_s))
 
-    def _shown(self, now_ns: int) -> Reading:
+    def _get_shown_value(self, now_ns: int) -> Reading:
         """pv: what the thermometer has given, as it was given, old or not."""
-        reading, channel = self._measured(), f"{self.name}.pv"
+        reading, channel = self._get_measurement(), f"{self.name}.pv"
         if reading is None:
             return bad_reading(channel, "degC", now_ns, f"thermometers.{self._settings.thermometer} was not read yet")
         return replace(reading, channel=channel)
 
 
-def _make(name: str, settings: SoftwareRegulatorSettings, around: Around) -> SoftwareRegulator:
+def _make(name: str, settings: SoftwareRegulatorSettings, around: DriverContext) -> SoftwareRegulator:
     module, relays = around.made.get("heat_module"), cast("Switches", around.made["relays"])
     return SoftwareRegulator(
         name,
@@ -293,12 +301,12 @@ def _make(name: str, settings: SoftwareRegulatorSettings, around: Around) -> Sof
     )
 
 
-async def _autotune(stand: Hands, name: str, given: Arguments) -> None:
+async def _autotune(stand: ManualActions, name: str, given: Arguments) -> None:
     await stand.heat(given["setpoint_degC"])
     await stand.device(name).autotune()
 
 
-async def _check(look: DeviceLook) -> None:
+async def _check(look: DeviceCheck) -> None:
     """Nothing is opened: what it measures and heats by is looked at by itself."""
     look.opened.add(look.name)
     by = "heat_module" if "heat_module" in look.made else f"relays.{HEAT}"

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from thermostand.drivers.sim.gige import gvcp, gvsp
 from thermostand.drivers.sim.gige.camera_registers import ControlChannel, Peer, Registers
-from thermostand.drivers.sim.gige.dressed_registers import DressedRegisters
-from thermostand.drivers.sim.gige.genicam import TICKS_PER_S, MAX_RATE_Hz, features
+from thermostand.drivers.sim.gige.genicam import TICKS_PER_S, MAX_RATE_Hz, make_features
 from thermostand.drivers.sim.gige.genicam_file import GenicamFile
+from thermostand.drivers.sim.gige.genicam_registers import GenicamRegisters
 from thermostand.drivers.sim.gige.gvcp import GvcpStatus, Nack, Resend
-from thermostand.drivers.sim.gige.gvsp import binned, encoded
+from thermostand.drivers.sim.gige.gvsp import bin_pixels, encode_image
 from thermostand.drivers.sim.gige.gvsp_sender import CameraFaults, StreamCounts, StreamSender
 from thermostand.drivers.sim.physics.plant import Plant
-from thermostand.foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, PIECE_S, Now, boot_time_ns, to_ns
 
 # When the camera exposes: software trigger and free run as a function of the clock; no thread, no socket.
 
@@ -215,15 +215,15 @@ class FakeCamera:
         self._render = render
         self._real_time = real_time
         self._warms_up = warms_up
-        self._boot_ns = seconds_ns(boot_s)
+        self._boot_ns = to_ns(boot_s)
         self._extended_ids = extended_ids
         self.faults = faults or CameraFaults()
-        self._control = _bound(address, gvcp.PORT)
+        self._control = _bind_socket(address, gvcp.PORT)
         self._control.settimeout(_TICK_s)
-        self._stream = _bound(address, 0)
-        table = features(*size_px, serial, stream_port=self._stream.getsockname()[1])
+        self._stream = _bind_socket(address, 0)
+        table = make_features(*size_px, serial, stream_port=self._stream.getsockname()[1])
         self._registers = (
-            Registers(table, address, serial) if genicam is None else DressedRegisters(table, address, serial, genicam)
+            Registers(table, address, serial) if genicam is None else GenicamRegisters(table, address, serial, genicam)
         )
         self._channel = ControlChannel(self._registers, self)
         self._schedule = Schedule(self._registers, real_time)
@@ -262,7 +262,7 @@ class FakeCamera:
     @property
     def unplayed(self) -> tuple[str, ...]:
         """Features of its GenICam file that no value of their registers makes work."""
-        return self._registers.unplayed if isinstance(self._registers, DressedRegisters) else ()
+        return self._registers.unplayed if isinstance(self._registers, GenicamRegisters) else ()
 
     @property
     def streaming(self) -> bool:
@@ -286,7 +286,7 @@ class FakeCamera:
                 thread.join()
         self._control.close()
         self._stream.close()
-        if isinstance(self._registers, DressedRegisters):
+        if isinstance(self._registers, GenicamRegisters):
             self._registers.close()
 
     def restart(self) -> None:
@@ -341,7 +341,7 @@ class FakeCamera:
                 continue
             if self.faults.pending > 0:
                 self.faults.pending -= 1
-                self._control.sendto(gvcp.pending(datagram, 2 * _PENDING_ms), peer)
+                self._control.sendto(gvcp.make_pending(datagram, 2 * _PENDING_ms), peer)
                 threading.Event().wait(_PENDING_ms / 1000)
             for _ in range(2 if self.faults.acks_twice else 1):
                 self._control.sendto(reply, peer)
@@ -460,14 +460,14 @@ class FakeCamera:
     def _block(self, shot: Exposure, image: NDArray[np.uint8]) -> gvsp.ImageBlock:
         value = self._registers.integer
         x, y, width, height = value("OffsetX"), value("OffsetY"), value("Width"), value("Height")
-        pixels = binned(image, *self._registers.binning)[y : y + height, x : x + width]
-        if pixels.shape != (height, width) and isinstance(self._registers, DressedRegisters):
+        pixels = bin_pixels(image, *self._registers.binning)[y : y + height, x : x + width]
+        if pixels.shape != (height, width) and isinstance(self._registers, GenicamRegisters):
             # its file may have a larger sensor: dark beyond ours
             missing = (height - pixels.shape[0], width - pixels.shape[1])
             pixels = np.pad(pixels, [(0, each) for each in missing])
         if pixels.shape != (height, width):
             raise ValueError(f"the renderer gave {image.shape}, too small for {width} x {height} at ({x}, {y})")
-        data = encoded(pixels, gvsp.PixelFormat(value("PixelFormat")))
+        data = encode_image(pixels, gvsp.PixelFormat(value("PixelFormat")))
         leader = gvsp.Leader(self._stamp(shot.start_ns), value("PixelFormat"), width, height, x, y)
         block_id = shot.index + 1 if self._extended_ids else shot.index % _SHORT_IDS + 1
         return gvsp.ImageBlock(block_id, leader, memoryview(data), value("GevSCPSPacketSize"), self._extended_ids)
@@ -483,7 +483,7 @@ class FakeCamera:
         return ticks
 
 
-def _bound(address: str, port: int) -> socket.socket:
+def _bind_socket(address: str, port: int) -> socket.socket:
     """A UDP socket; OSError when the port is taken."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

@@ -105,7 +105,7 @@ class Registers:
     def integer(self, name: str) -> int:
         """The value of an integer, enumeration or boolean feature."""
         feature = self._table[name]
-        return _field(feature, int.from_bytes(self._load(feature.address, feature.length), "big"))
+        return _extract_field(feature, int.from_bytes(self._load(feature.address, feature.length), "big"))
 
     @property
     def binning(self) -> tuple[int, int]:
@@ -124,7 +124,7 @@ class Registers:
             self._store(feature.address, struct.pack(">d", value))
             return
         word = int.from_bytes(self._load(feature.address, feature.length), "big")
-        word = word & ~(largest(feature) << feature.lsb) | int(value) << feature.lsb
+        word = word & ~(get_largest(feature) << feature.lsb) | int(value) << feature.lsb
         self._store(feature.address, word.to_bytes(feature.length, "big"))
 
     def covers(self, name: str, address: int, count: int) -> bool:
@@ -204,20 +204,20 @@ class Registers:
         segment[offset : offset + len(data)] = data
 
 
-def largest(feature: Feature) -> int:
+def get_largest(feature: Feature) -> int:
     """All bits of the feature's field."""
     return (1 << (feature.bits or 8 * feature.length)) - 1
 
 
-def _field(feature: Feature, word: int) -> int:
-    return word >> feature.lsb & largest(feature)
+def _extract_field(feature: Feature, word: int) -> int:
+    return word >> feature.lsb & get_largest(feature)
 
 
 def _decode(feature: Feature, data: bytes) -> float:
     if feature.kind == "float":
         (value,) = struct.unpack(">d", data)
         return value
-    return _field(feature, int.from_bytes(data, "big"))
+    return _extract_field(feature, int.from_bytes(data, "big"))
 
 
 # The device's end of GVCP: who is in control, what each command does; datagrams in, datagrams out, no socket.

@@ -59,7 +59,7 @@ class Feature:
         return self.bits > 0
 
 
-def features(width: int, height: int, serial: str, stream_port: int = 0) -> tuple[Feature, ...]:
+def make_features(width: int, height: int, serial: str, stream_port: int = 0) -> tuple[Feature, ...]:
     """The table of a camera with a sensor of width x height px; defaults are the user set after power-on.
 
     `stream_port` is the UDP port that its stream comes from.
@@ -272,24 +272,24 @@ def to_xml(table: tuple[Feature, ...]) -> bytes:
     for category in categories:
         _category(root, category, [feature.name for feature in shown if feature.category == category])
     for feature in shown:
-        _nodes(root, feature)
+        _add_nodes(root, feature)
     port = ET.SubElement(root, "Port", Name="Device", NameSpace="Standard")
-    _leaves(port, ("Visibility", "Invisible"))
+    _add_leaves(port, ("Visibility", "Invisible"))
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
 def _category(root: ET.Element, name: str, members: list[str]) -> None:
     category = ET.SubElement(root, "Category", Name=name, NameSpace="Standard")
-    _leaves(category, *(("pFeature", member) for member in members))
+    _add_leaves(category, *(("pFeature", member) for member in members))
 
 
-def _leaves(node: ET.Element, *pairs: tuple[str, object]) -> None:
+def _add_leaves(node: ET.Element, *pairs: tuple[str, object]) -> None:
     for tag, value in pairs:
         ET.SubElement(node, tag).text = str(value)
 
 
-def _nodes(root: ET.Element, feature: Feature) -> None:
+def _add_nodes(root: ET.Element, feature: Feature) -> None:
     """The feature's node and that of its register; a string is its own register."""
     if feature.kind == "string":
         _register(ET.SubElement(root, "StringReg", Name=feature.name, NameSpace="Standard"), feature)
@@ -299,36 +299,36 @@ def _nodes(root: ET.Element, feature: Feature) -> None:
     )
     node = ET.SubElement(root, tag, Name=feature.name, NameSpace="Standard")
     if feature.locked:
-        _leaves(node, ("pIsLocked", "TLParamsLocked"))
+        _add_leaves(node, ("pIsLocked", "TLParamsLocked"))
     for symbol, value in feature.entries:
         entry = ET.SubElement(node, "EnumEntry", Name=symbol, NameSpace="Standard")
-        _leaves(entry, ("Value", int(value)))
-    _leaves(node, ("pValue", f"{feature.name}Reg"))
+        _add_leaves(entry, ("Value", int(value)))
+    _add_leaves(node, ("pValue", f"{feature.name}Reg"))
     if feature.kind in ("integer", "float"):
         _range(root, node, feature)
     elif feature.kind == "command":
-        _leaves(node, ("CommandValue", 1))
+        _add_leaves(node, ("CommandValue", 1))
     elif feature.kind == "boolean":
-        _leaves(node, ("OnValue", 1), ("OffValue", 0))
-    _leaves(node, *(("pSelected", name) for name in feature.selects))
+        _add_leaves(node, ("OnValue", 1), ("OffValue", 0))
+    _add_leaves(node, *(("pSelected", name) for name in feature.selects))
     _register_node(root, feature)
 
 
 def _range(root: ET.Element, node: ET.Element, feature: Feature) -> None:
-    _leaves(node, ("Min", feature.minimum))
+    _add_leaves(node, ("Min", feature.minimum))
     if feature.headroom is None:
-        _leaves(node, ("Max", feature.maximum))
+        _add_leaves(node, ("Max", feature.maximum))
     else:
         whole, used = feature.headroom
         knife = ET.SubElement(root, "IntSwissKnife", Name=f"{feature.name}MaxExpr")
         for variable, name in (("WHOLE", whole), ("USED", used)):
             ET.SubElement(knife, "pVariable", Name=variable).text = name
-        _leaves(knife, ("Formula", "WHOLE - USED"))
-        _leaves(node, ("pMax", f"{feature.name}MaxExpr"))
+        _add_leaves(knife, ("Formula", "WHOLE - USED"))
+        _add_leaves(node, ("pMax", f"{feature.name}MaxExpr"))
     if feature.kind == "integer":
-        _leaves(node, ("Inc", feature.increment))
+        _add_leaves(node, ("Inc", feature.increment))
     if feature.unit:
-        _leaves(node, ("Unit", feature.unit))
+        _add_leaves(node, ("Unit", feature.unit))
 
 
 def _register_node(root: ET.Element, feature: Feature) -> None:
@@ -336,14 +336,14 @@ def _register_node(root: ET.Element, feature: Feature) -> None:
     node = ET.SubElement(root, tag, Name=f"{feature.name}Reg", NameSpace="Custom")
     _register(node, feature)
     if feature.masked:  # the XML numbers the bits of a big-endian register from the most significant one
-        _leaves(node, ("LSB", 31 - feature.lsb), ("MSB", 31 - feature.lsb - feature.bits + 1))
+        _add_leaves(node, ("LSB", 31 - feature.lsb), ("MSB", 31 - feature.lsb - feature.bits + 1))
     if feature.kind != "float":
-        _leaves(node, ("Sign", "Unsigned"))
-    _leaves(node, ("Endianess", "BigEndian"))
+        _add_leaves(node, ("Sign", "Unsigned"))
+    _add_leaves(node, ("Endianess", "BigEndian"))
 
 
 def _register(node: ET.Element, feature: Feature) -> None:
-    _leaves(
+    _add_leaves(
         node,
         ("Address", f"{feature.address:#x}"),
         ("Length", feature.length),

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from thermostand.drivers.framing.aravis_library import AravisError, library
+from thermostand.drivers.framing.aravis_library import AravisError, load_library
 from thermostand.foundation.errors import ConfigError
 
 LARGEST_bytes = 16 << 20  # ten times the largest of 27 makes and models
@@ -50,14 +50,14 @@ class GenicamFile:
             name = element.get("Name")
             if name and _tag(element) not in _NOT_A_NODE:
                 self._nodes.setdefault(name, element)
-        if circular := self._circular():
+        if circular := self._find_circular_node():
             raise ConfigError(f"{what} cannot be evaluated: the value of its {circular} is made of itself")
         for name in filter(lambda each: self.kind(each) in _NUMBERS, self._nodes):
-            length = self.named(name, "Length")
+            length = self.find_named(name, "Length")
             if length and not 1 <= _integer(length) <= _LONGEST_bytes:
                 raise ConfigError(f"{what} cannot be evaluated: its {name} has the Length {length}, not 1 to 8 bytes")
 
-    def _circular(self) -> str:
+    def _find_circular_node(self) -> str:
         """A node whose value is made of itself, over however many others, on which Aravis would crash; "" for none."""
         ended: set[str] = set()
         for start in self._nodes:
@@ -72,10 +72,10 @@ class GenicamFile:
                 elif name not in ended:
                     path[name] = None
                     ahead.append((name, True))
-                    ahead += [(each, False) for each in self._made_of(name, _EVALUATED)]
+                    ahead += [(each, False) for each in self._iterate_parts(name, _EVALUATED)]
         return ""
 
-    def _made_of(self, name: str, properties: frozenset[str]) -> Iterator[str]:
+    def _iterate_parts(self, name: str, properties: frozenset[str]) -> Iterator[str]:
         """The nodes that properties of a node name."""
         for child in self._nodes[name]:
             if _tag(child) in properties and "." not in child.get("Name", ""):  # a formula's "X.Max" is no value
@@ -90,7 +90,7 @@ class GenicamFile:
         """The node's kind: Integer, Float, Enumeration, MaskedIntReg, ..."""
         return _tag(self._nodes[name])
 
-    def named(self, name: str, property_name: str) -> str:
+    def find_named(self, name: str, property_name: str) -> str:
         """The node that a property such as pMax or pValue names; "" when the node has no such property."""
         return next((child.text or "" for child in self._nodes[name] if _tag(child) == property_name), "").strip()
 
@@ -100,22 +100,22 @@ class GenicamFile:
 
     def conditions(self, name: str) -> Iterator[str]:
         """The nodes that say whether a node is there, and whether what its value is made of is."""
-        for each in self.reached(name):
+        for each in self.find_reached(name):
             yield from _conditions(self._nodes[each])
 
     def registers(self, name: str) -> tuple[str, ...]:
         """The registers that a node's value is made of, nearest first."""
-        return tuple(each for each in self.reached(name) if self.kind(each) in REGISTERS)
+        return tuple(each for each in self.find_reached(name) if self.kind(each) in REGISTERS)
 
     def written(self, name: str) -> tuple[str, ...]:
         """The registers that writing a node may write: which one a selector says."""
-        return tuple(each for each in self.reached(name, _WRITTEN) if self.kind(each) in REGISTERS)
+        return tuple(each for each in self.find_reached(name, _WRITTEN) if self.kind(each) in REGISTERS)
 
-    def reached(self, name: str, properties: frozenset[str] = _MADE_OF) -> list[str]:
+    def find_reached(self, name: str, properties: frozenset[str] = _MADE_OF) -> list[str]:
         """The node, and all that its value is made of, nearest first."""
         reached = [name]
         for each in reached:
-            reached += [other for other in dict.fromkeys(self._made_of(each, properties)) if other not in reached]
+            reached += [other for other in dict.fromkeys(self._iterate_parts(each, properties)) if other not in reached]
         return reached
 
 
@@ -128,10 +128,10 @@ def read_genicam(path: Path) -> GenicamFile:
         raise ConfigError(f"the GenICam file {path} cannot be read: {error.strerror}") from error
     if len(text) > LARGEST_bytes:
         raise ConfigError(f"{path} is no GenICam file: it has more than {LARGEST_bytes >> 20} MB")
-    return GenicamFile(_unzipped(text, path) if text.startswith(_ZIP) else text, str(path))
+    return GenicamFile(_unzip(text, path) if text.startswith(_ZIP) else text, str(path))
 
 
-def _unzipped(data: bytes, path: Path) -> bytes:
+def _unzip(data: bytes, path: Path) -> bytes:
     """The XML file in an archive, as many cameras hold theirs."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -249,7 +249,7 @@ _READ, _WRITE = _ACCESS(_read), _ACCESS(_write)  # kept for the life of the clas
 @functools.cache
 def _device_type() -> tuple[int, object]:
     """The GType of the device in memory, and what has to live as long as it does."""
-    functions = library()
+    functions = load_library()
     parent, query, gobject = functions["arv_device_get_type"](), _TypeQuery(), _TypeQuery()
     functions["g_type_query"](parent, ctypes.byref(query))
     functions["g_type_query"](_G_TYPE_OBJECT, ctypes.byref(gobject))
@@ -276,13 +276,13 @@ def _device_type() -> tuple[int, object]:
 _G_TYPE_OBJECT = 20 << 2  # gtype.h
 
 
-class Evaluated:
+class EvaluatedFile:
     """A file's nodes over a memory; one thread at a time. AravisError where Aravis cannot evaluate a node."""
 
     def __init__(self, file: GenicamFile) -> None:
         self.file = file
         self.memory = SparseMemory()
-        self._library = library()
+        self._library = load_library()
         self._device = self._library["g_object_new"](_device_type()[0], None)
         _MEMORIES[self._device] = self.memory
         self._xml = file.xml  # Aravis may keep the pointer
@@ -335,10 +335,10 @@ class Evaluated:
 
     def command_value(self, name: str) -> int:
         """What a Command writes; ConfigError when that is no number."""
-        named = self.file.named(name, "pCommandValue")
+        named = self.file.find_named(name, "pCommandValue")
         if named in self.file:
             return round(self.get(named))
-        text = named or self.file.named(name, "CommandValue") or "0"
+        text = named or self.file.find_named(name, "CommandValue") or "0"
         try:
             return int(text, 0)
         except ValueError as error:

@@ -92,7 +92,7 @@ class Ack:
         return _ACK.pack(self.status, self.command + 1, len(self.payload), self.req_id) + self.payload
 
 
-def pending(request: bytes, time_ms: int) -> bytes:
+def make_pending(request: bytes, time_ms: int) -> bytes:
     """PENDING_ACK to a command: its answer takes so long."""
     req_id = _COMMAND.unpack_from(request)[-1]
     return Ack(GvcpCommand.PENDING, req_id, struct.pack(">HH", 0, time_ms)).encode()
@@ -107,10 +107,10 @@ def decode_request(datagram: bytes) -> GvcpRequest:
         raise Malformed(f"key {key:#04x} instead of {_KEY:#04x}")
     if command == _NO_COMMAND:
         raise Malformed(f"command {command:#06x}, which no acknowledge can answer")
-    return GvcpRequest(command, req_id, _body(datagram, length), flags)
+    return GvcpRequest(command, req_id, _get_body(datagram, length), flags)
 
 
-def _body(datagram: bytes, length: int) -> bytes:
+def _get_body(datagram: bytes, length: int) -> bytes:
     body = datagram[8 : 8 + length]
     if len(body) < length:
         raise Malformed(f"{len(body)} of {length} payload bytes")

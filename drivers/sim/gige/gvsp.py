@@ -63,7 +63,7 @@ def header_size(extended: bool) -> int:
     return _EXTENDED.size if extended else _SHORT.size
 
 
-def header(kind: PacketKind, block_id: int, packet_id: int, status: int, extended: bool) -> bytes:
+def make_header(kind: PacketKind, block_id: int, packet_id: int, status: int, extended: bool) -> bytes:
     """The header of one packet."""
     if extended:
         return _EXTENDED.pack(status, 0, (_EXTENDED_BIT | kind) << 24, block_id, packet_id)
@@ -122,7 +122,7 @@ class ImageBlock:
         else:
             begin = (packet_id - 1) * self.data_size
             kind, data = PacketKind.PAYLOAD, self.pixels[begin : begin + self.data_size]
-        return header(kind, self.block_id, packet_id, status, self.extended), data
+        return make_header(kind, self.block_id, packet_id, status, self.extended), data
 
 
 # Pixels as a camera sends them: 8 bits of the scene in any of its formats (GigE Vision 1.2, section 27; PFNC 2.1).
@@ -133,13 +133,13 @@ _IN_THREE_BYTES = {PixelFormat.MONO10PACKED: 10, PixelFormat.MONO12PACKED: 12}
 _GAPLESS = {PixelFormat.MONO10P: 10, PixelFormat.MONO12P: 12}
 
 
-def encoded(image: NDArray[np.uint8], pixel_format: PixelFormat) -> bytes:
+def encode_image(image: NDArray[np.uint8], pixel_format: PixelFormat) -> bytes:
     """The bytes of an image, its 8 bits as the upper ones of each pixel."""
     if pixel_format in _BITS:
         return (image.astype("<u2") << _BITS[pixel_format] - 8).astype("<u2").tobytes()
     if pixel_format in _IN_THREE_BYTES:
         bits = _IN_THREE_BYTES[pixel_format]
-        return _in_three_bytes((image.reshape(-1).astype(np.uint16) << bits - 8).astype(np.uint16), bits)
+        return _pack_in_three_bytes((image.reshape(-1).astype(np.uint16) << bits - 8).astype(np.uint16), bits)
     if pixel_format in _GAPLESS:
         bits = _GAPLESS[pixel_format]
         values = image.reshape(-1, 1).astype(np.uint16) << bits - 8
@@ -147,7 +147,7 @@ def encoded(image: NDArray[np.uint8], pixel_format: PixelFormat) -> bytes:
     return image.tobytes()
 
 
-def _in_three_bytes(values: NDArray[np.uint16], bits: int) -> bytes:
+def _pack_in_three_bytes(values: NDArray[np.uint16], bits: int) -> bytes:
     """Two pixels in three bytes: upper 8 bits, both lower parts (the first's in the lower half), upper 8 bits."""
     low = bits - 8
     pairs = np.append(values, np.zeros(len(values) % 2, np.uint16)).reshape(-1, 2)
@@ -156,7 +156,7 @@ def _in_three_bytes(values: NDArray[np.uint16], bits: int) -> bytes:
     return packed[: -(-len(values) * 12 // 8)]
 
 
-def binned(image: NDArray[np.uint8], across: int, down: int) -> NDArray[np.uint8]:
+def bin_pixels(image: NDArray[np.uint8], across: int, down: int) -> NDArray[np.uint8]:
     """The mean of so many pixels across and down in the place of each; what does not fill one at the edges is left
     out."""
     if across == down == 1:

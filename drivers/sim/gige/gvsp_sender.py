@@ -247,7 +247,7 @@ class StreamSender:
             return
         _, destination = self._kept[-1]
         kind = gvsp.PacketKind.PAYLOAD
-        header = gvsp.header(kind, resend.block_id, resend.first, gvsp.UNAVAILABLE, resend.extended)
+        header = gvsp.make_header(kind, resend.block_id, resend.first, gvsp.UNAVAILABLE, resend.extended)
         self._queue.refusals.append((header, destination))
 
     # -------------------------------------------------------------------------------------------------- the thread

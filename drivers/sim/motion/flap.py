@@ -14,7 +14,7 @@ from typing import Any
 from thermostand.drivers.sim.fakes import FLAP, Bench, fake
 from thermostand.drivers.sim.physics.plant import Plant
 from thermostand.drivers.sim.usb import Stall, TimedOut, UsbServer
-from thermostand.foundation.addresses import tcp_place
+from thermostand.foundation.addresses import parse_tcp_address
 from thermostand.foundation.clock import NS_PER_S, Now
 
 VENDOR_ID, PRODUCT_ID_21V3 = 0x1FFB, 0x00C5
@@ -107,7 +107,7 @@ class FakeFlap:
         self._active_errors = 0
         self._jam: float | None = None
         self._lowest, self._highest = 0.0, float(FULL_SCALE)
-        self._eeprom = _delivered()
+        self._eeprom = _make_delivered_settings()
         standing = FlapDrive(clock.now_ns(), closed_position, closed_position, closed_position, 0.0)
         self._drives: deque[FlapDrive] = deque([standing], maxlen=16)
         self.restart(reset_cause=0)
@@ -309,7 +309,7 @@ class FakeFlap:
         )
 
 
-def _delivered() -> bytearray:
+def _make_delivered_settings() -> bytearray:
     block = bytearray(SETTINGS_SIZE)
     for offset, (kind, value) in DELIVERED_SETTINGS.items():
         struct.pack_into(f"<{kind}", block, offset, value)
@@ -319,6 +319,6 @@ def _delivered() -> bytearray:
 @fake("flap", rank=FLAP)
 def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeFlap:
     flap = FakeFlap(bench.plant, bench.clock, settings["serial_number"])
-    bus = UsbServer(*tcp_place(settings["backend_address"] or "", may_be_free=True), [flap])
-    bench.found_at(name, bus.address, bus.close)
+    bus = UsbServer(*parse_tcp_address(settings["backend_address"] or "", may_be_free=True), [flap])
+    bench.register_address(name, bus.address, bus.close)
     return flap

@@ -92,42 +92,42 @@ class Path:
         return None
 
 
-def rest(position: float) -> Path:
+def make_rest(position: float) -> Path:
     """Standing at `position`."""
     return Path((), position)
 
 
-def path_to(position: float, speed: float, target: float, pace: Pace) -> Path:
+def plan_path_to(position: float, speed: float, target: float, pace: Pace) -> Path:
     """From a moving start to rest at `target`; turns round when the target lies behind or too near to stop."""
     if pace.speed == 0:
-        return path_onward(position, speed, 1, pace)
+        return plan_path_onward(position, speed, 1, pace)
     halt = position + speed * abs(speed) / (2 * pace.decel)
     if speed * (target - halt) < 0:
-        return _joined(path_to_halt(position, speed, pace.decel), path_to(halt, 0.0, target, pace))
+        return _join(plan_path_to_halt(position, speed, pace.decel), plan_path_to(halt, 0.0, target, pace))
     direction = 1 if target >= position else -1
     distance, entry = abs(target - position), abs(speed)
     reach = distance + entry**2 / (2 * pace.accel)
     top = min(pace.speed, math.sqrt(2 * reach * pace.accel * pace.decel / (pace.accel + pace.decel)))
     if top == 0:
-        return rest(target)
+        return make_rest(target)
     gain = pace.accel if top >= entry else -pace.decel
     cruise = distance - (top**2 - entry**2) / (2 * gain) - top**2 / (2 * pace.decel)
     stretches = [((top - entry) / gain, gain), (max(0.0, cruise) / top, 0.0), (top / pace.decel, -pace.decel)]
     return Path(_phases(position, speed, [(duration_s, direction * accel) for duration_s, accel in stretches]), target)
 
 
-def path_onward(position: float, speed: float, direction: int, pace: Pace) -> Path:
+def plan_path_onward(position: float, speed: float, direction: int, pace: Pace) -> Path:
     """From a moving start to the top speed in `direction` (1 or -1), for ever."""
     if speed * direction < 0:
-        halt = path_to_halt(position, speed, pace.decel)
-        return _joined(halt, path_onward(halt.end, 0.0, direction, pace))
+        halt = plan_path_to_halt(position, speed, pace.decel)
+        return _join(halt, plan_path_onward(halt.end, 0.0, direction, pace))
     entry = abs(speed)
     gain = pace.accel if pace.speed >= entry else -pace.decel
     stretches = [((pace.speed - entry) / gain, direction * gain), (math.inf, 0.0)]
     return Path(_phases(position, speed, stretches), math.nan)
 
 
-def path_to_halt(position: float, speed: float, decel: float) -> Path:
+def plan_path_to_halt(position: float, speed: float, decel: float) -> Path:
     """Braking to rest."""
     end = position + speed * abs(speed) / (2 * decel)
     return Path(_phases(position, speed, [(abs(speed) / decel, -math.copysign(decel, speed))]), end)
@@ -144,7 +144,7 @@ def _phases(position: float, speed: float, stretches: list[tuple[float, float]])
     return tuple(phases)
 
 
-def _joined(first: Path, second: Path) -> Path:
+def _join(first: Path, second: Path) -> Path:
     return Path(first.phases + second.phases, second.end)
 
 

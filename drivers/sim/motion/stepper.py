@@ -11,8 +11,15 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
-from thermostand.drivers.sim.motion.kinematics import Pace, Path, path_onward, path_to, path_to_halt, rest
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.drivers.sim.motion.kinematics import (
+    Pace,
+    Path,
+    make_rest,
+    plan_path_onward,
+    plan_path_to,
+    plan_path_to_halt,
+)
+from thermostand.foundation.clock import NS_PER_S, to_ns
 
 LEFT, RIGHT = -1, 1
 SWITCH_PLAY = 1 / 256  # steps; a stage stopped by a switch keeps it closed in spite of rounding
@@ -133,22 +140,22 @@ class Stepper:
         self.stops = Stops()
         self.stall_at: float | None = None
         self.stuck_switch = 0
-        resting = Journey(time_ns, rest(0.0), mechanical, energised=False, rest_ns=time_ns)
+        resting = Journey(time_ns, make_rest(0.0), mechanical, energised=False, rest_ns=time_ns)
         self._travels: deque[Journey] = deque([resting], maxlen=HISTORY)
 
     def go(self, time_ns: int, *legs: Leg) -> None:
         """Leave what was under way and do `legs` one after the other, from the present position and speed."""
         travel = self.travel(time_ns)
         count, speed = travel.path.at(travel.elapsed_s(time_ns))
-        self._travels.append(_begun(time_ns, count, speed, self._slip(travel, time_ns), legs))
+        self._travels.append(_begin(time_ns, count, speed, self._slip(travel, time_ns), legs))
 
     def halt(self, time_ns: int) -> None:
         """Stand still at once."""
-        self._travels.append(self._halted(self.travel(time_ns), time_ns))
+        self._travels.append(self._halt_at(self.travel(time_ns), time_ns))
 
     def release(self, time_ns: int) -> None:
         """Take the current off the windings."""
-        self._travels.append(replace(self._halted(self.travel(time_ns), time_ns), energised=False))
+        self._travels.append(replace(self._halt_at(self.travel(time_ns), time_ns), energised=False))
 
     def disturb(self, time_ns: int, lost_steps: float = 0.0) -> None:
         """Begin the rest of the journey afresh, so that faults set after this call act from now on; the mechanics
@@ -172,10 +179,10 @@ class Stepper:
     def travel(self, time_ns: int) -> Journey:
         """The leg of that time, begun and ended events included. Times before the history give its first entry."""
         travel = next((past for past in reversed(self._travels) if past.start_ns <= time_ns), self._travels[0])
-        while (ending := self._ending(travel)) is not None and ending.time_ns <= time_ns:
+        while (ending := self._find_end(travel)) is not None and ending.time_ns <= time_ns:
             slip = self._slip(travel, ending.time_ns)
             legs = () if ending.limit else travel.legs
-            travel = replace(_begun(ending.time_ns, ending.count, 0.0, slip, legs), limit=ending.limit)
+            travel = replace(_begin(ending.time_ns, ending.count, 0.0, slip, legs), limit=ending.limit)
         return travel
 
     def count(self, time_ns: int) -> float:
@@ -210,12 +217,12 @@ class Stepper:
         """An obstacle behind the stage does not pull it back."""
         return max(stall_at, travel.path.at(0.0)[0] + travel.slip)
 
-    def _halted(self, travel: Journey, time_ns: int) -> Journey:
-        path = rest(travel.path.at(travel.elapsed_s(time_ns))[0])
+    def _halt_at(self, travel: Journey, time_ns: int) -> Journey:
+        path = make_rest(travel.path.at(travel.elapsed_s(time_ns))[0])
         rest_ns = time_ns if travel.leg else travel.rest_ns
         return Journey(time_ns, path, self._slip(travel, time_ns), energised=travel.energised, rest_ns=rest_ns)
 
-    def _ending(self, travel: Journey) -> LegEnd | None:
+    def _find_end(self, travel: Journey) -> LegEnd | None:
         """How the leg under way will end, None when there is none or it never does."""
         if travel.leg is None:
             return None
@@ -228,7 +235,7 @@ class Stepper:
                 count = count if reached_s > 0 else travel.path.at(0.0)[0]
                 endings.append((reached_s, count, 0 if wanted else direction))
         ends_s, count, limit = min(endings)
-        return None if ends_s == math.inf else LegEnd(travel.start_ns + seconds_ns(ends_s), count, limit)
+        return None if ends_s == math.inf else LegEnd(travel.start_ns + to_ns(ends_s), count, limit)
 
     def _stop_count(self, travel: Journey, direction: int, wanted: bool) -> float:
         """The count at which motion in `direction` will end, infinite when nothing stops it."""
@@ -245,20 +252,20 @@ class Stepper:
         return place - self._slip_past(travel, turning)
 
 
-def _begun(time_ns: int, count: float, speed: float, slip: float, legs: tuple[Leg, ...]) -> Journey:
+def _begin(time_ns: int, count: float, speed: float, slip: float, legs: tuple[Leg, ...]) -> Journey:
     """The first of `legs`, from `count` and `speed`; at rest when there is none."""
     if not legs:
-        return Journey(time_ns, rest(count), slip, rest_ns=time_ns)
+        return Journey(time_ns, make_rest(count), slip, rest_ns=time_ns)
     return Journey(time_ns, _path(legs[0], count, speed), slip, legs[0], legs[1:])
 
 
 def _path(leg: Leg, position: float, speed: float) -> Path:
     match leg:
         case GoTo(target, pace):
-            return path_to(position, speed, target, pace)
+            return plan_path_to(position, speed, target, pace)
         case Shift(steps, pace):
-            return path_to(position, speed, position + steps, pace)
+            return plan_path_to(position, speed, position + steps, pace)
         case Onward(direction, pace):
-            return path_onward(position, speed, direction, pace)
+            return plan_path_onward(position, speed, direction, pace)
         case Brake(decel):
-            return path_to_halt(position, speed, decel)
+            return plan_path_to_halt(position, speed, decel)

@@ -20,7 +20,7 @@ from thermostand.drivers.sim.motion import ximc_table as table
 from thermostand.drivers.sim.motion.kinematics import Pace
 from thermostand.drivers.sim.motion.stepper import LEFT, RIGHT, Brake, GoTo, Leg, Onward, Shift, Stepper, Stops
 from thermostand.drivers.sim.physics.plant import Plant
-from thermostand.foundation.clock import Now, seconds_ns
+from thermostand.foundation.clock import Now, to_ns
 from thermostand.foundation.documents import Document
 
 PARTIAL_FRAME_S = 0.4  # real seconds of silence inside a frame after which the controller forgets it
@@ -120,9 +120,9 @@ class Settings:
     def resting_power(self, rested_ns: int) -> int:
         """PWRSts after a rest: full current until CurrReductDelay, none at all after PowerOffDelay, if enabled."""
         _, reduce_ms, off_s, _, flags = self._fields("pwr")
-        if flags & table.POWER_OFF and rested_ns >= seconds_ns(off_s):
+        if flags & table.POWER_OFF and rested_ns >= to_ns(off_s):
             return table.PWR_OFF
-        if flags & table.POWER_REDUCE and rested_ns >= seconds_ns(reduce_ms / 1000):
+        if flags & table.POWER_REDUCE and rested_ns >= to_ns(reduce_ms / 1000):
             return table.PWR_REDUCED
         return table.PWR_NORMAL
 

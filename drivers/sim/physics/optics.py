@@ -100,7 +100,7 @@ class CameraDeformation:
     turn_rad: tuple[float, float, float]
 
 
-def strain(temperature_degC: float, expansion_per_K: float, einstein_K: float) -> float:
+def compute_strain(temperature_degC: float, expansion_per_K: float, einstein_K: float) -> float:
     """Relative length change of a solid since 24 degC, `expansion_per_K` being its coefficient there.
 
     Expansion follows the energy of the lattice (Grueneisen), taken as an Einstein oscillator
@@ -114,21 +114,25 @@ def strain(temperature_degC: float, expansion_per_K: float, einstein_K: float) -
     return expansion_per_K * (energy_K - reference_energy_K) / heat_capacity
 
 
-def pad_sag_mm(temperature_degC: float) -> float:
+def compute_pad_sag_mm(temperature_degC: float) -> float:
     """How far the elastic lens mounting gives under its load: it softens by a third around 45 degC."""
     softening = 0.33 / (1.0 + math.exp((45.0 - temperature_degC) / 12.0))
     return 1.2e-3 / (1.0 - softening)
 
 
-def modified_camera(nodes: Nodes) -> CameraDeformation:
+def deform_modified_camera(nodes: Nodes) -> CameraDeformation:
     """Sensor between granite columns, lens on granite prisms, no link between them (paper, section 4)."""
-    carrier_mm = 11.2 * strain(nodes.sensor_degC, ALUMINIUM_per_K, 1000.0)  # the sensor slides up between its columns
-    barrel_mm = 4.6 * strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # the barrel lifts the axis off the prisms
-    sag_mm = pad_sag_mm(nodes.lens_degC) - pad_sag_mm(REFERENCE_degC)
-    column_mm = 2.6 * strain(nodes.body_degC, ALUMINIUM_per_K, 700.0)  # the columns are not quite alike
-    prism_mm = 0.5 * strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # nor are the prisms
-    spacing = 0.8 * strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)  # columns and prisms share the base
-    lens = strain(nodes.lens_degC, 4.5e-6, 800.0)
+    carrier_mm = 11.2 * compute_strain(
+        nodes.sensor_degC, ALUMINIUM_per_K, 1000.0
+    )  # the sensor slides up between its columns
+    barrel_mm = 4.6 * compute_strain(
+        nodes.lens_degC, ALUMINIUM_per_K, 320.0
+    )  # the barrel lifts the axis off the prisms
+    sag_mm = compute_pad_sag_mm(nodes.lens_degC) - compute_pad_sag_mm(REFERENCE_degC)
+    column_mm = 2.6 * compute_strain(nodes.body_degC, ALUMINIUM_per_K, 700.0)  # the columns are not quite alike
+    prism_mm = 0.5 * compute_strain(nodes.lens_degC, ALUMINIUM_per_K, 320.0)  # nor are the prisms
+    spacing = 0.8 * compute_strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)  # columns and prisms share the base
+    lens = compute_strain(nodes.lens_degC, 4.5e-6, 800.0)
     sensor_warming_K = nodes.sensor_degC - REFERENCE_degC
     bow_rad = -1.8e-6 * (nodes.granite_inside_degC - nodes.granite_outside_degC)
     return CameraDeformation(
@@ -140,10 +144,10 @@ def modified_camera(nodes: Nodes) -> CameraDeformation:
     )
 
 
-def unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> CameraDeformation:
+def deform_unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> CameraDeformation:
     """Sensor screwed to the housing, lens in a C-mount: larger, dependent on orientation, and it does not come back."""
-    housing_mm = 14.0 * strain(nodes.body_degC, ALUMINIUM_per_K, 320.0)
-    board_mm = 4.0 * strain(nodes.sensor_degC, 16.0e-6, 1100.0)
+    housing_mm = 14.0 * compute_strain(nodes.body_degC, ALUMINIUM_per_K, 320.0)
+    board_mm = 4.0 * compute_strain(nodes.sensor_degC, 16.0e-6, 1100.0)
     mount_K = nodes.body_degC - nodes.lens_degC  # a gradient across the mount bends it
     droop_mm = 0.9e-4 * (nodes.body_degC - REFERENCE_degC)  # the mount yields to the lens's weight as it warms
     slack_K, grip_K = nodes.tensions_K if nodes.tensions_K else (0.0, 0.0)
@@ -152,25 +156,25 @@ def unmodified_camera(nodes: Nodes, camera_roll_rad: float) -> CameraDeformation
             0.28 * housing_mm + 5.0e-5 * slack_K + 4.0e-5 * grip_K + droop_mm * math.sin(camera_roll_rad),
             0.30 * housing_mm + board_mm + 11.0e-5 * slack_K + 8.0e-5 * grip_K + droop_mm * math.cos(camera_roll_rad),
         ),
-        stretch=strain(nodes.lens_degC, 4.5e-6, 800.0) + strain(nodes.body_degC, 7.0e-6, 320.0),
+        stretch=compute_strain(nodes.lens_degC, 4.5e-6, 800.0) + compute_strain(nodes.body_degC, 7.0e-6, 320.0),
         k1=-0.12 + 1.0e-5 * (nodes.lens_degC - REFERENCE_degC),
         sensor_tilt_rad=(9.0e-6 * mount_K, 4.0e-6 * mount_K),
         turn_rad=(3.0e-6 * mount_K, 1.0e-6 * mount_K, 2.0e-6 * grip_K),
     )
 
 
-def optics_at(kind: CameraKind, nodes: Nodes, placement: StandPlacement) -> Optics:
+def compute_optics_at(kind: CameraKind, nodes: Nodes, placement: StandPlacement) -> Optics:
     """The camera and the target's pose for these temperatures and this placement."""
     roll_rad = math.radians(placement.camera_roll_deg)
-    camera = modified_camera(nodes) if kind == "modified" else unmodified_camera(nodes, roll_rad)
-    return optics_of(camera, nodes, placement)
+    camera = deform_modified_camera(nodes) if kind == "modified" else deform_unmodified_camera(nodes, roll_rad)
+    return compute_optics(camera, nodes, placement)
 
 
-def optics_of(camera: CameraDeformation, nodes: Nodes, placement: StandPlacement) -> Optics:
+def compute_optics(camera: CameraDeformation, nodes: Nodes, placement: StandPlacement) -> Optics:
     """This camera before the target, with the stand's temperatures (those of `nodes` that are not the camera's)."""
     roll_rad = math.radians(placement.camera_roll_deg)
-    inside = strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)
-    outside = strain(nodes.granite_outside_degC, GRANITE_per_K, 900.0)
+    inside = compute_strain(nodes.granite_inside_degC, GRANITE_per_K, 900.0)
+    outside = compute_strain(nodes.granite_outside_degC, GRANITE_per_K, 900.0)
     half_mm = placement.distance_mm / 2.0  # the chamber's wall crosses the granite half way
     return Optics(
         f_px=FOCAL_px * (1.0 + camera.stretch),
@@ -186,11 +190,11 @@ def optics_of(camera: CameraDeformation, nodes: Nodes, placement: StandPlacement
         ),
         target_turn_rad=math.radians(placement.rotary_deg),
         target_roll_rad=math.radians(placement.target_roll_deg),
-        target_scale=1.0 + strain(nodes.artifact_degC, GLASS_per_K, 500.0),
+        target_scale=1.0 + compute_strain(nodes.artifact_degC, GLASS_per_K, 500.0),
     )
 
 
-def marker_centres_mm() -> NDArray[np.float64]:
+def make_marker_centres_mm() -> NDArray[np.float64]:
     """(54, 2) nominal centres (X right, Y up) about the target's centre; marker 1 bottom left, along the long side."""
     row, column = np.divmod(np.arange(MARKER_COLUMNS * MARKER_ROWS), MARKER_COLUMNS)
     centred = np.stack((column - (MARKER_COLUMNS - 1) / 2, row - (MARKER_ROWS - 1) / 2), axis=-1)
@@ -208,16 +212,16 @@ def project(optics: Optics, target_mm: NDArray[np.float64]) -> NDArray[np.float6
     return on_sensor[..., :2] / on_sensor[..., 2:] + (optics.cx_px, optics.cy_px)
 
 
-def outlines_px(optics: Optics, points: int = OUTLINE_POINTS) -> NDArray[np.float64]:
+def compute_outlines_px(optics: Optics, points: int = OUTLINE_POINTS) -> NDArray[np.float64]:
     """(54, points, 2) vertices of the projected disc outlines, px."""
     angle = 2.0 * math.pi * np.arange(points) / points
     circle_mm = MARKER_DIAMETER_mm / 2 * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-    return project(optics, marker_centres_mm()[:, None, :] + circle_mm)
+    return project(optics, make_marker_centres_mm()[:, None, :] + circle_mm)
 
 
-def true_centres_px(optics: Optics) -> NDArray[np.float64]:
+def compute_true_centres_px(optics: Optics) -> NDArray[np.float64]:
     """(54, 2) centroids (x, y) of the projected discs, px, by Green's theorem on the outline; marker 1 first."""
-    outline = outlines_px(optics)
+    outline = compute_outlines_px(optics)
     origin = outline.mean(axis=1, keepdims=True)  # keeps the products small
     here = outline - origin
     after = np.roll(here, -1, axis=1)

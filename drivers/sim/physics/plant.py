@@ -18,16 +18,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
+from thermostand.drivers.sim.physics.hysteresis import BoucWen
 from thermostand.drivers.sim.physics.optics import (
     CameraDeformation,
     CameraKind,
     Nodes,
     Optics,
     StandPlacement,
-    optics_at,
-    optics_of,
+    compute_optics,
+    compute_optics_at,
 )
-from thermostand.drivers.sim.physics.wear import BoucWen
 from thermostand.foundation.clock import NS_PER_S, Now
 
 # What one simulated chamber is made of: heat capacities, conductances, powers and lags of its thermal network.
@@ -85,7 +85,7 @@ _ALONE = ("heater_W", "compressor_W", "probe_lag_s", "near_lag_s")
 
 
 # The limits of the guard were chosen on ten chambers drawn so, and judged on others.
-def drawn(seed: int, spread: float = 0.3) -> ChamberSpec:
+def draw_chamber(seed: int, spread: float = 0.3) -> ChamberSpec:
     """Another chamber of the kind: every conductance, every lag, the heater and the compressor drawn independently and
     evenly within +-`spread` of the standard one's. A heat capacity is its lag times its conductance."""
     draw = random.Random(f"chamber {seed}")
@@ -166,7 +166,7 @@ class Plant:
 
     def __init__(self, spec: PlantSpec, start_ns: int) -> None:
         self.spec = spec
-        self._chamber = ChamberSpec() if spec.chamber_seed is None else drawn(spec.chamber_seed)
+        self._chamber = ChamberSpec() if spec.chamber_seed is None else draw_chamber(spec.chamber_seed)
         self.lock = threading.RLock()
         self.now_ns = start_ns
         self.on_step: list[Callable[[int, float], None]] = []
@@ -237,8 +237,8 @@ class Plant:
             distance_mm=self.spec.distance_mm,
         )
         if camera is None or isinstance(camera, str):
-            return optics_at(camera or self.spec.camera, nodes, placement)
-        return optics_of(camera.optics(math.radians(placement.camera_roll_deg)), nodes, placement)
+            return compute_optics_at(camera or self.spec.camera, nodes, placement)
+        return compute_optics(camera.optics(math.radians(placement.camera_roll_deg)), nodes, placement)
 
     def state(self) -> dict[str, float]:
         """Every temperature, input and power by its attribute's name, at grid time; booleans as 0 or 1."""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.drivers.camera_preset import Bounds, CameraPreset, Effect
+from thermostand.drivers.sim.physics.hysteresis import Backlash, Fixings, Lag, StickSlip
 from thermostand.drivers.sim.physics.optics import CameraDeformation, PITCH_mm, REFERENCE_degC
-from thermostand.drivers.sim.physics.wear import Fixings, Lag, Play, StickSlip
 
 CHIP, BODY, CELL, GLASS, MOUNT = range(5)
 # Assumed; what these parts move is published (configs/optics), and of what does not repeat nobody has published a
@@ -77,19 +77,19 @@ class PublishedCamera:
         self._cell_share = draw.within((0.3, 0.7))
         self._radial_per_K = draw.within(preset.radial_per_K)
         drift_px_per_K, body_share = draw.within(preset.principal_point_px_per_K), draw.within((0.3, 0.8))
-        self._body_px_per_K = _scaled(draw.direction(), drift_px_per_K * body_share)
-        self._cell_px_per_K = _scaled(draw.direction(), drift_px_per_K * (1 - body_share))
-        self._tilt_per_K = _scaled(draw.direction(), _TILT_per_K)
-        self._turn_per_K = _scaled((*draw.direction(), 1.0), _TURN_rad_per_K)
+        self._body_px_per_K = _scale(draw.direction(), drift_px_per_K * body_share)
+        self._cell_px_per_K = _scale(draw.direction(), drift_px_per_K * (1 - body_share))
+        self._tilt_per_K = _scale(draw.direction(), _TILT_per_K)
+        self._turn_per_K = _scale((*draw.direction(), 1.0), _TURN_rad_per_K)
         self._give_px, self._softening_K = draw.within(preset.sag.give_px), draw.within(preset.sag.softening_K)
         zone, slip, places = preset.dead_zone, preset.stick_slip, preset.unrepeated
-        self._plays = [
-            (Play(draw.within(zone.half_K)), _scaled(draw.direction(), draw.within(zone.px_per_K))) for _ in range(2)
+        self._backlashes = [
+            (Backlash(draw.within(zone.half_K)), _scale(draw.direction(), draw.within(zone.px_per_K))) for _ in range(2)
         ]
         self._creep = Lag(3600 * draw.within(preset.creep.hours), plant.air_degC - REFERENCE_degC)
-        self._creep_px_per_K = _scaled(draw.direction(), drift_px_per_K * draw.within(preset.creep.share))
+        self._creep_px_per_K = _scale(draw.direction(), drift_px_per_K * draw.within(preset.creep.share))
         self._slip = StickSlip(draw.within(slip.threshold_K), f"{seed} slip")
-        self._slip_px_per_K = _scaled(draw.direction(), draw.within(slip.px_per_K))
+        self._slip_px_per_K = _scale(draw.direction(), draw.within(slip.px_per_K))
         self._fixings = Fixings(draw.within(places.scatter_px), draw.within(places.travel_K), f"{seed} fixings")
         sensor, far = preset.coarse_sensor, preset.far_air
         self._sensor = Lag(draw.within(sensor.lag_s), plant.air_degC)
@@ -109,7 +109,7 @@ class PublishedCamera:
         self._sensor.step(self._degC[CHIP], dt_s)
         self._far.step(air_degC, dt_s)
         self._creep.step(away_K[CELL], dt_s)
-        for play, _ in self._plays:
+        for play, _ in self._backlashes:
             play.step(away_K[MOUNT])
         self._slip.step(away_K[BODY])
         self._fixings.step(abs(float(self._degC[BODY]) - before_degC), dt_s)
@@ -139,8 +139,8 @@ class PublishedCamera:
         bent_K = [each * (1 + self._bend_per_K * each) for each in away_K]
         glass_share = 1 - self._cell_share
         stretch = self._scale_per_K * (self._cell_share * bent_K[CELL] + glass_share * bent_K[GLASS])
-        moved = [_scaled(self._body_px_per_K, bent_K[BODY]), _scaled(self._cell_px_per_K, bent_K[CELL])]
-        moved += self._beyond(camera_roll_rad, away_K)
+        moved = [_scale(self._body_px_per_K, bent_K[BODY]), _scale(self._cell_px_per_K, bent_K[CELL])]
+        moved += self._compute_shifts(camera_roll_rad, away_K)
         lean_K = away_K[BODY] - away_K[CELL]
         return CameraDeformation(
             sensor_mm=(PITCH_mm * sum(each[0] for each in moved), PITCH_mm * sum(each[1] for each in moved)),
@@ -154,17 +154,17 @@ class PublishedCamera:
             ),
         )
 
-    def _beyond(self, camera_roll_rad: float, away_K: list[float]) -> Iterator[tuple[float, ...]]:
+    def _compute_shifts(self, camera_roll_rad: float, away_K: list[float]) -> Iterator[tuple[float, ...]]:
         """What the effects move the principal point by, px."""
         if "sag" in self._effects:
             down = (math.sin(camera_roll_rad), math.cos(camera_roll_rad))
-            yield _scaled(down, self._give_px * math.expm1(away_K[CELL] / self._softening_K))
+            yield _scale(down, self._give_px * math.expm1(away_K[CELL] / self._softening_K))
         if "dead_zone" in self._effects:
-            yield from (_scaled(weight, play.place_K) for play, weight in self._plays)
+            yield from (_scale(weight, play.place_K) for play, weight in self._backlashes)
         if "creep" in self._effects:
-            yield _scaled(self._creep_px_per_K, self._creep.value)
+            yield _scale(self._creep_px_per_K, self._creep.value)
         if "stick_slip" in self._effects:
-            yield _scaled(self._slip_px_per_K, self._slip.place_K)
+            yield _scale(self._slip_px_per_K, self._slip.place_K)
         if "unrepeated" in self._effects:
             yield self._fixings.place_px
 
@@ -186,7 +186,7 @@ class _Draw:
         return math.cos(angle), math.sin(angle)
 
 
-def _scaled(vector: Sequence[float], factor: float) -> tuple[float, ...]:
+def _scale(vector: Sequence[float], factor: float) -> tuple[float, ...]:
     return tuple(factor * each for each in vector)
 
 

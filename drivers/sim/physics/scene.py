@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.drivers.sim.physics.optics import HEIGHT_px, Optics, WIDTH_px, outlines_px
+from thermostand.drivers.sim.physics.optics import HEIGHT_px, Optics, WIDTH_px, compute_outlines_px
 
 SUBCELLS = 4  # cells per pixel and axis
 BLUR_REACH = 6.0  # the Gaussian is followed this many sigma outwards
@@ -94,7 +94,7 @@ class SimulatedScene:
             self._light = _light(spec, rows)
         image = self._light[:rows] * _shadow(flap_open, scale * (spec.paper_DN - spec.black_DN))[:rows]
         darkening = np.float32(1.0 - (spec.disc_DN - spec.black_DN) / (spec.paper_DN - spec.black_DN))
-        for left, top, coverage in disc_coverages(optics, spec.blur_px, rows):
+        for left, top, coverage in compute_disc_coverages(optics, spec.blur_px, rows):
             _dim(image, left, top, 1.0 - darkening * coverage)
         image += np.float32(spec.black_DN)
         return image
@@ -103,7 +103,7 @@ class SimulatedScene:
 Picture = Callable[[Optics, int, float, float, float, int], NDArray[np.uint8]]
 
 
-def still(render: Picture) -> Picture:
+def make_still(render: Picture) -> Picture:
     """The same as `Scene.render`, rendered once and shown until another exposure, gain, flap or region is asked for."""
     kept: dict[tuple[float, float, float, int], NDArray[np.uint8]] = {}
 
@@ -119,18 +119,20 @@ def still(render: Picture) -> Picture:
     return shown
 
 
-def disc_coverages(optics: Optics, blur_px: float, rows: int = HEIGHT_px) -> list[tuple[int, int, NDArray[np.float32]]]:
+def compute_disc_coverages(
+    optics: Optics, blur_px: float, rows: int = HEIGHT_px
+) -> list[tuple[int, int, NDArray[np.float32]]]:
     """Per marker that reaches into the upper `rows` (left, top, coverage): its blurred disc, 0..1 per pixel, and the
     pixel of the array's corner.
 
     Arrays are not cut at the image's border; the sum of a coverage is the disc's area in px^2.
     """
     margin_px = math.ceil(BLUR_REACH * blur_px) + 1
-    least, most = _boxes(outlines_px(optics, 16))
+    least, most = _boxes(compute_outlines_px(optics, 16))
     widest_px = (most - least).max()
     if least[:, 1].min() - 0.1 * widest_px - margin_px > rows:  # these outlines are 2 % of a radius too small at most
         return []
-    outlines = outlines_px(optics, math.ceil(math.pi * widest_px * 1.1 * SUBCELLS / EDGE_CELLS))
+    outlines = compute_outlines_px(optics, math.ceil(math.pi * widest_px * 1.1 * SUBCELLS / EDGE_CELLS))
     least, most = _boxes(outlines)
     corners = np.floor(least).astype(int) - margin_px
     width, height = (np.ceil(most).astype(int) + margin_px + 1 - corners).max(axis=0)
@@ -140,7 +142,7 @@ def disc_coverages(optics: Optics, blur_px: float, rows: int = HEIGHT_px) -> lis
         if top >= rows:
             continue
         cells = (outline - (left, top) + 0.5) * SUBCELLS
-        fine = polygon_coverage(cells, int(width) * SUBCELLS, int(height) * SUBCELLS).astype(np.float32)
+        fine = compute_polygon_coverage(cells, int(width) * SUBCELLS, int(height) * SUBCELLS).astype(np.float32)
         coverage = np.empty((int(height), int(width)), dtype=np.float32)
         np.matmul(down @ fine, across.T, out=coverage)
         discs.append((int(left), int(top), coverage))
@@ -153,7 +155,7 @@ def _boxes(outlines: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return np.stack((x.min(axis=1), y.min(axis=1)), axis=-1), np.stack((x.max(axis=1), y.max(axis=1)), axis=-1)
 
 
-def polygon_coverage(vertices: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
+def compute_polygon_coverage(vertices: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
     """(height, width) exact area of a polygon in each unit cell; cell [row, column] spans column .. column + 1.
 
     Vertices (n, 2) are (x, y) inside the grid; edges must be shorter than a cell. By Green's theorem each piece of edge

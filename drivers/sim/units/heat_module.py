@@ -26,7 +26,7 @@ from thermostand.drivers.sim.units.modbus import (
     writes_one,
     writes_words,
 )
-from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, to_ns
 
 OUTPUTS = 4
 COIL_ON, COIL_OFF = 0xFF00, 0x0000
@@ -140,7 +140,7 @@ class FakeHeatModule(BusUnit):
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
         self._watch(time_ns)
-        before, dt_ns = self._share(), seconds_ns(dt_s)
+        before, dt_ns = self._share(), to_ns(dt_s)
         left_ns = self._heard_ns + self.timeout_tenths * TENTH_NS - time_ns
         self._watch(time_ns + dt_ns)
         after = self._share()

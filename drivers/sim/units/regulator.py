@@ -26,7 +26,7 @@ from thermostand.drivers.sim.units.modbus import (
     writes_words,
 )
 from thermostand.drivers.sim.units.pid import OFF, Gains, Outputs, PidState, Side, on_time_ns, resume, start, step
-from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, to_ns
 
 # The stored registers of the fake Omron E5CC, two-byte mode: address, value at delivery, range, decimals.
 #
@@ -102,7 +102,7 @@ PARAMETERS = {
 }
 
 
-def gains_of(ram: Mapping[int, float]) -> Gains:
+def read_gains(ram: Mapping[int, float]) -> Gains:
     """The constants of the PID that these registers hold."""
     return Gains(
         heat=Side(ram[HEAT_BAND], ram[HEAT_INTEGRAL], ram[HEAT_DERIVATIVE], ram[MV_UPPER]),
@@ -111,7 +111,7 @@ def gains_of(ram: Mapping[int, float]) -> Gains:
     )
 
 
-def stored_at(address: int) -> int:
+def find_stored_address(address: int) -> int:
     """Where the value of an address is kept: SP0 is the set point."""
     return SETPOINT if address == SETPOINT_0 else address
 
@@ -230,7 +230,7 @@ class FakeRegulator(BusUnit):
         self._tuning_share = 1.0
         self._cycle: Cycle | None = None
         self._drifted_K = 0.0
-        self._felt_degC = plant.chamber_degC  # by the probe, wherever it is
+        self._probe_degC = plant.chamber_degC  # by the probe, wherever it is
         self._eeprom = {address: parameter.default for address, parameter in PARAMETERS.items()}
         self.functions = {
             0x03: reads_words(self._read, MOST_WORDS),
@@ -238,7 +238,7 @@ class FakeRegulator(BusUnit):
             0x08: echoes,
             0x10: writes_words(self._write, MOST_WORDS),
         }
-        self._measurements = self._measured()
+        self._measurements = self._make_measurements()
         self._commands = self._operation_commands()
         self._power_up()
         plant.on_step.append(self._on_step)
@@ -250,10 +250,10 @@ class FakeRegulator(BusUnit):
         return None if self.compoway else super().handle(pdu)
 
     def _read(self, address: int, count: int) -> list[int]:
-        first = stored_at(address)
+        first = find_stored_address(address)
         if first not in PARAMETERS and first not in self._measurements:
             raise ModbusRefusal(ILLEGAL_ADDRESS)
-        return [self._register(stored_at(each)) for each in range(address, address + count)]
+        return [self._register(find_stored_address(each)) for each in range(address, address + count)]
 
     def _register(self, address: int) -> int:
         """One register; the holes between the known ones read as 0."""
@@ -263,7 +263,7 @@ class FakeRegulator(BusUnit):
             return to_word(self._ram[address], self._decimals(address))
         return 0
 
-    def _measured(self) -> dict[int, Callable[[], int]]:
+    def _make_measurements(self) -> dict[int, Callable[[], int]]:
         """The read-only registers; no current transformer is fitted, and status 2 has nothing to say."""
         return {
             0x2000: lambda: to_word(self._shown_degC(), self.display_decimals),
@@ -297,7 +297,7 @@ class FakeRegulator(BusUnit):
 
     def _write(self, address: int, words: Sequence[int]) -> None:
         """Write all or nothing; refused in the order of H175 4-1-3: address, value, operating state."""
-        addresses = [stored_at(each) for each in range(address, address + len(words))]
+        addresses = [find_stored_address(each) for each in range(address, address + len(words))]
         if not all(each in PARAMETERS for each in addresses):
             raise ModbusRefusal(ILLEGAL_ADDRESS)
         values = [to_value(word, self._decimals(each)) for each, word in zip(addresses, words, strict=True)]
@@ -322,7 +322,7 @@ class FakeRegulator(BusUnit):
             low, high = self.setpoint_clamp_degC
             value = min(high, max(low, value))
         self._ram[address] = value
-        self._gains = gains_of(self._ram)
+        self._gains = read_gains(self._ram)
         if keep:
             self._eeprom[address] = value
             self.eeprom_writes += 1
@@ -366,7 +366,7 @@ class FakeRegulator(BusUnit):
         self._modes |= {Mode.STOP}
         self._modes -= {Mode.TUNING}
         self._pid = None
-        self.outputs = _signed(self._ram[MV_AT_STOP])
+        self.outputs = _split_signed(self._ram[MV_AT_STOP])
 
     def _tune(self, share: float) -> None:
         """A limit cycle with that share of the outputs, around the set point, until it is cancelled or has shown the
@@ -394,7 +394,7 @@ class FakeRegulator(BusUnit):
 
     def _power_up(self) -> None:
         self._ram = dict(self._eeprom)
-        self._gains = gains_of(self._ram)
+        self._gains = read_gains(self._ram)
         self._modes = {Mode.STOP}
         self._pid: PidState | None = None
         self.outputs = OFF
@@ -437,43 +437,43 @@ class FakeRegulator(BusUnit):
 
     # Control.
 
-    def _feel(self, dt_s: float) -> None:
+    def _update_probe(self, dt_s: float) -> None:
         """The probe takes the temperature of its place; in the laboratory, in still air, slowly."""
         plant = self._plant
         if self.probe_out:
-            self._felt_degC += (plant.laboratory_degC - self._felt_degC) * dt_s / STILL_AIR_LAG_S
+            self._probe_degC += (plant.laboratory_degC - self._probe_degC) * dt_s / STILL_AIR_LAG_S
         else:
-            self._felt_degC = plant.air_degC if self.probe_exchanged else plant.chamber_degC
+            self._probe_degC = plant.air_degC if self.probe_exchanged else plant.chamber_degC
         self._drifted_K += self.pv_drift_K_per_h * dt_s / 3600
 
     def _on_step(self, time_ns: int, dt_s: float) -> None:
-        self._feel(dt_s)
+        self._update_probe(dt_s)
         self._ramp(dt_s)
         self.outputs = self._control(dt_s)
         heat_pct = self.outputs.heat_pct
         if heat_pct <= 0:
             self._plant.heater_on_fraction = 0.0
             return
-        dt_ns = seconds_ns(dt_s)
+        dt_ns = to_ns(dt_s)
         on_ns = on_time_ns(time_ns, time_ns + dt_ns, heat_pct / 100, self._period_ns(HEAT_PERIOD))
         self._plant.heater_on_fraction = on_ns / dt_ns
 
     def _control(self, dt_s: float) -> Outputs:
         if Mode.STOP in self._modes:
-            return _signed(self._ram[MV_AT_STOP])
+            return _split_signed(self._ram[MV_AT_STOP])
         if Mode.MANUAL in self._modes:
             return self.outputs
         if self.sensor_break or self.ad_error:
             self._pid = None
-            return _signed(self._ram[MV_AT_ERROR])
+            return _split_signed(self._ram[MV_AT_ERROR])
         pv_degC = self._pv_degC()
         if Mode.TUNING in self._modes:
             self._pid = None
-            return self._tuned(pv_degC - self._target_degC())
+            return self._step_limit_cycle(pv_degC - self._target_degC())
         outputs, self._pid = step(self._pid or start(pv_degC), self._target_degC(), pv_degC, dt_s, self._gains)
         return outputs
 
-    def _tuned(self, error_K: float) -> Outputs:
+    def _step_limit_cycle(self, error_K: float) -> Outputs:
         """One step of the limit cycle; at its end the constants are those it has shown."""
         upper, lower = (self._tuning_share * self._ram[limit] for limit in (MV_UPPER, MV_LOWER))
         cycle = self._cycle or begin(error_K)
@@ -486,7 +486,7 @@ class FakeRegulator(BusUnit):
                     value = round(min(known.high, max(known.low, value)), known.decimals or 1)
                     self._store(address, value, keep=Mode.RAM not in self._modes)
             self._modes.discard(Mode.TUNING)
-        return _signed(upper if cycle.heats else lower)
+        return _split_signed(upper if cycle.heats else lower)
 
     def _target_degC(self) -> float:
         """Where it goes: the internal set point."""
@@ -506,7 +506,7 @@ class FakeRegulator(BusUnit):
     def _pv_degC(self) -> float:
         if self.stuck_pv_degC is not None:
             return self.stuck_pv_degC
-        return self._felt_degC + self._drifted_K + self.pv_offset_K + self._ram[INPUT_SHIFT]
+        return self._probe_degC + self._drifted_K + self.pv_offset_K + self._ram[INPUT_SHIFT]
 
     def _shown_degC(self) -> float:
         low_degC, high_degC = PT100_RANGE_DEGC
@@ -514,14 +514,14 @@ class FakeRegulator(BusUnit):
 
     def _period_ns(self, address: int) -> int:
         coded = self._ram[address]
-        return seconds_ns(SHORT_PERIODS_S.get(int(coded), coded))
+        return to_ns(SHORT_PERIODS_S.get(int(coded), coded))
 
     def _conducts(self, output_pct: float, period_address: int) -> bool:
         """Whether a time-proportioned output is on at the instant of the request."""
         return on_time_ns(self._now_ns, self._now_ns + 1, output_pct / 100, self._period_ns(period_address)) > 0
 
 
-def _signed(mv_pct: float) -> Outputs:
+def _split_signed(mv_pct: float) -> Outputs:
     """A signed manipulated value (negative = cooling) as two outputs."""
     return Outputs(max(0.0, mv_pct), max(0.0, -mv_pct))
 

@@ -23,7 +23,7 @@ from thermostand.drivers.sim.units.modbus import (
     writes_bits,
     writes_one,
 )
-from thermostand.foundation.clock import NS_PER_S, Now, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Now, to_ns
 
 RELAYS = 8
 ALL_RELAYS = 0x00FF
@@ -167,7 +167,7 @@ class FakeRelays(BusUnit):
         self._switch(time_ns)
         if "heat" in self._channels:  # pulses end within a step
             relay = self._relays[self._channels["heat"]]
-            share = relay.closed_share(time_ns, seconds_ns(dt_s))
+            share = relay.closed_share(time_ns, to_ns(dt_s))
             self._plant.heater_on_fraction = 1.0 if "heat" in self.welded else share
 
     def _switch(self, time_ns: int) -> None:

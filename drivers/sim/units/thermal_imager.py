@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from thermostand.drivers.sim.fakes import PICTURES, Bench, fake
 from thermostand.drivers.sim.physics.plant import Plant
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 
 # Writes radiometric JPEGs as a FLIR E40 stores them. Source: the public tag tables of ExifTool.
 #
@@ -30,7 +30,7 @@ ENTRIES = 14
 CHUNK = 65_524  # bytes of the block in a full segment
 R1, R2, B, F, O = 15401.146, 0.0111986, 1406.3, 1.0, -6063  # noqa: E741 - FLIR's names
 KELVIN = 273.15
-ROOM_K = 20.0 + KELVIN
+AMBIENT_K = 20.0 + KELVIN
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class RadiometricShot:
     emissivity: float = 1.0
 
 
-def counts_of(celsius: NDArray[np.float64], emissivity: float = 1.0) -> NDArray[np.uint16]:
+def compute_counts(celsius: NDArray[np.float64], emissivity: float = 1.0) -> NDArray[np.uint16]:
     """What the sensor counts."""
-    own, room = (R1 / (R2 * (np.exp(B / kelvin) - F)) - O for kelvin in (celsius + KELVIN, np.float64(ROOM_K)))
-    radiance = emissivity * own + (1 - emissivity) * room
+    own, routes = (R1 / (R2 * (np.exp(B / kelvin) - F)) - O for kelvin in (celsius + KELVIN, np.float64(AMBIENT_K)))
+    radiance = emissivity * own + (1 - emissivity) * routes
     return np.clip(np.rint(radiance), 0, 65535).astype(np.uint16)
 
 
-def jpeg_of(shot: RadiometricShot, *, is_damaged: bool = False) -> bytes:
+def make_jpeg(shot: RadiometricShot, *, is_damaged: bool = False) -> bytes:
     """The file; a damaged one lacks the end of its counts."""
     shown = np.clip((shot.celsius - shot.celsius.min()) / max(np.ptp(shot.celsius), 0.1) * 255, 0, 255)
     encoded, picture = cv2.imencode(".jpg", shown.astype(np.uint8))
@@ -77,7 +77,7 @@ def _block(shot: RadiometricShot) -> bytes:
         (32, 0, 0x6F, _camera(shot)),
         (34, 0, 0, bytes(784)),
         (33, 0, 0x105, _measurements(shot.spots)),
-        (1, 3 if shot.png else 2, 0x65, _raw(counts_of(shot.celsius, shot.emissivity), shot.png)),
+        (1, 3 if shot.png else 2, 0x65, _raw(compute_counts(shot.celsius, shot.emissivity), shot.png)),
     ]
     begin = 0x40 + ENTRIES * 32
     directory, body = b"", b""
@@ -101,7 +101,7 @@ def _raw(counts: NDArray[np.uint16], png: bool) -> bytes:
 
 
 def _camera(shot: RadiometricShot) -> bytes:
-    reals = {32: shot.emissivity, 36: 1.0, 40: ROOM_K, 44: ROOM_K, 48: ROOM_K, 52: 1.0, 60: 0.5}
+    reals = {32: shot.emissivity, 36: 1.0, 40: AMBIENT_K, 44: AMBIENT_K, 48: AMBIENT_K, 52: 1.0, 60: 0.5}
     reals |= {88: R1, 92: B, 96: F, 128: 1.0, 436: 25.0, 780: R2}  # alpha and beta are 0, X is 1: clear air
     record = bytearray(2476)
     for offset, value in reals.items():
@@ -156,7 +156,7 @@ class FakeThermalImager:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._spots = dict(spots)
         self._noise = np.random.default_rng(seed)
-        self._period_ns = seconds_ns(period_s)
+        self._period_ns = to_ns(period_s)
         self._due_ns = 0
         self._number = 0
         self._last = b""
@@ -222,7 +222,7 @@ class FakeThermalImager:
         shot = RadiometricShot(
             celsius, time_ns / NS_PER_S + self.clock_s, self.serial_number, self.labels, emissivity=0.95
         )
-        return jpeg_of(shot, is_damaged=self.damaged)
+        return make_jpeg(shot, is_damaged=self.damaged)
 
     def _scene(self) -> NDArray[np.float64]:
         sight = self._sight
@@ -245,5 +245,5 @@ def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeThermalI
     folder = None if settings["folder"] is None else Path(settings["folder"])
     spots = {spot: (each["x_px"], each["y_px"]) for spot, each in settings["spots"].items()}
     imager = FakeThermalImager(bench.plant, folder, spots, bench.seed)
-    bench.found_at(name, str(imager.folder), imager.close)
+    bench.register_address(name, str(imager.folder), imager.close)
     return imager

@@ -91,8 +91,8 @@ class RtdModule(BusUnit):
             return self.stuck_degC[channel]
         noise_K = self._noise(channel) * (NOISY_K if channel == self.noisy_channel else NOISE_K)
         wrong_K = self.offset_K.get(channel, 0.0) + self._drifted_K.get(channel, 0.0)
-        felt_degC = self.held_degC.get(channel, self._loose_degC.get(channel, self._sensors[channel]()))
-        return felt_degC + noise_K + wrong_K
+        probe_degC = self.held_degC.get(channel, self._loose_degC.get(channel, self._sensors[channel]()))
+        return probe_degC + noise_K + wrong_K
 
     def _air_degC(self) -> float:
         return self._plant.chamber_degC if self.air_exchanged else self._plant.air_degC
@@ -185,7 +185,7 @@ class FakeThermometers(RtdModule):
         return [self._word(channel) for channel in range(address, address + count)]
 
     def _word(self, channel: int) -> int:
-        measured_degC = self.measured_degC(channel) + _signed(self._register_offsets[channel]) / 10
+        measured_degC = self.measured_degC(channel) + _to_signed(self._register_offsets[channel]) / 10
         low_degC, high_degC = RANGES_DEGC[self.type_codes[channel]]
         if measured_degC > high_degC:
             return OVER_RANGE
@@ -251,7 +251,7 @@ class FakeThermometers(RtdModule):
         return data + replies[data[0]]
 
 
-def _signed(word: int) -> int:
+def _to_signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
 
 

@@ -15,16 +15,16 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.exit_codes import FAILED
-from thermostand.foundation.output import output, say, show
-from thermostand.foundation.progress import late_progress
-from thermostand.foundation.usage import one_line, tell
-from thermostand.recording.exporting.archive import Rule, archive, delete, unfit
+from thermostand.foundation.output import get_output, say, show
+from thermostand.foundation.progress import show_late_progress
+from thermostand.foundation.usage import escape_line, print_error
+from thermostand.recording.exporting.archive import DeletionRule, archive, delete, explain_unfit
 from thermostand.recording.reading.catalogue import ListedSession
-from thermostand.stand.commands.reached import ConfigOption
+from thermostand.stand.commands.endpoint import ConfigOption
 from thermostand.stand.commands.sessions.session_args import check_folder
-from thermostand.stand.commands.sessions.session_list_cli import sessions_at, user_name
-from thermostand.stand.commands.sessions.session_table import size
-from thermostand.stand.config.stand_config import load_config, packaged
+from thermostand.stand.commands.sessions.session_list_cli import get_user_name, list_sessions_at
+from thermostand.stand.commands.sessions.session_table import format_size
+from thermostand.stand.config.stand_config import find_packaged, load_config
 
 app = App(no_args_is_help=True)
 _NICENESS = 15  # whatever a stand does on this computer goes first
@@ -56,7 +56,7 @@ def archive_sessions(
 
     Example: stand session archive /data/sessions --to /mnt/nas/sessions --delete-after 30
     """
-    recording = load_config(packaged("", config)).recording
+    recording = load_config(find_packaged("", config)).recording
     place, out = directory or recording.directory, to or recording.archive_directory
     if out is None:
         raise ConfigError("where to? give --to DIR, or recording.archive_directory in the stand's file")
@@ -64,17 +64,17 @@ def archive_sessions(
         raise ConfigError(f"{out}: lies inside of {place}; the copies belong on another disk")
     with suppress(OSError):
         os.nice(_NICENESS)
-    done = _Done()
-    _copy(sessions_at(place), out, done, again=again)
+    done = _ArchiveResult()
+    _copy(list_sessions_at(place), out, done, again=again)
     if delete_after is not None:
-        _delete(sessions_at(place), Rule(delete_after), done, yes=yes)
+        _delete(list_sessions_at(place), DeletionRule(delete_after), done, yes=yes)
     show(done.data(), ())
     if done.failed:
         raise typer.Exit(FAILED)
 
 
 @dataclass
-class _Done:
+class _ArchiveResult:
     """What became of the sessions, by name. gone: whose copy is gone; due: those that the rule would delete."""
 
     copied: dict[str, Path] = field(default_factory=dict[str, Path])
@@ -88,19 +88,21 @@ class _Done:
         return asdict(self)
 
 
-def _line(text: str) -> None:
+def _print_line(text: str) -> None:
     """For people, as it happens."""
-    if not output().as_json:
-        typer.echo(one_line(text))
+    if not get_output().as_json:
+        typer.echo(escape_line(text))
 
 
-def _to_copy(entries: Sequence[ListedSession], out: Path, found: _Done, *, again: bool) -> list[ListedSession]:
+def _select_to_copy(
+    entries: Sequence[ListedSession], out: Path, found: _ArchiveResult, *, again: bool
+) -> list[ListedSession]:
     """Those without a copy in `out`. Those that must wait are listed, and those whose copy is gone: a disk that is not
     mounted must not fill the one that its place is on."""
     due: list[ListedSession] = []
     for entry in entries:
         copy = (out / entry.name).resolve()
-        if not entry.archived and (reason := unfit(entry)):
+        if not entry.archived and (reason := explain_unfit(entry)):
             found.waiting[entry.name] = reason
             say(f"{entry.name}: not yet: {reason}")
         elif not entry.archived or Path(entry.archived) != copy or (again and not copy.exists()):
@@ -108,50 +110,50 @@ def _to_copy(entries: Sequence[ListedSession], out: Path, found: _Done, *, again
         elif not copy.exists():
             found.gone.append(entry.name)
             found.failed.append(entry.name)
-            tell(SessionError(f"{copy}: the copy is gone; is its disk connected? `--again` makes another"))
+            print_error(SessionError(f"{copy}: the copy is gone; is its disk connected? `--again` makes another"))
     return due
 
 
-def _copy(entries: Sequence[ListedSession], out: Path, found: _Done, *, again: bool) -> None:
-    due = _to_copy(entries, out, found, again=again)
+def _copy(entries: Sequence[ListedSession], out: Path, found: _ArchiveResult, *, again: bool) -> None:
+    due = _select_to_copy(entries, out, found, again=again)
     if out.exists() and any(entry.path.stat().st_dev == out.stat().st_dev for entry in due):
         say(f"warning: {out}: is on the disk that the sessions are on")
     done = 0
-    with late_progress("archive", 2 * sum(entry.size_bytes for entry in due)) as report:
+    with show_late_progress("archive", 2 * sum(entry.size_bytes for entry in due)) as report:
         for entry in due:
 
             def count(size_bytes: int, name: str = entry.name) -> None:
                 nonlocal done
                 done += size_bytes
-                report(done, one_line(name))
+                report(done, escape_line(name))
 
             try:
-                copy = archive(entry, out, user_name(), WallClock().now_ns(), count)
+                copy = archive(entry, out, get_user_name(), WallClock().now_ns(), count)
                 found.copied[entry.name] = copy
-                _line(f"{entry.name}: copied to {copy} and read back ({size(entry.size_bytes)})")
+                _print_line(f"{entry.name}: copied to {copy} and read back ({format_size(entry.size_bytes)})")
             except SessionError as error:
-                tell(error)
+                print_error(error)
                 found.failed.append(entry.name)
     if not due:
         have = sum(bool(entry.archived) for entry in entries) - len(found.gone)
-        _line(f"nothing to copy: {have} of {len(entries)} have a copy in {out}")
+        _print_line(f"nothing to copy: {have} of {len(entries)} have a copy in {out}")
 
 
-def _delete(entries: Sequence[ListedSession], rule: Rule, found: _Done, *, yes: bool) -> None:
+def _delete(entries: Sequence[ListedSession], rule: DeletionRule, found: _ArchiveResult, *, yes: bool) -> None:
     """The rule and what it applies to; deleted only with `yes`."""
-    _line(f"{rule}:")
+    _print_line(f"{rule}:")
     due = [entry for entry in entries if rule.applies(entry, WallClock().now_ns())]
     for entry in due:
         found.due.append(entry.name)
         if not yes:
-            _line(f"  {entry.path} ({size(entry.size_bytes)}), copy in {entry.archived}")
+            _print_line(f"  {entry.path} ({format_size(entry.size_bytes)}), copy in {entry.archived}")
             continue
         try:
             delete(entry)
             found.deleted.append(entry.name)
-            _line(f"  {entry.path}: deleted ({size(entry.size_bytes)}); its copy is {entry.archived}")
+            _print_line(f"  {entry.path}: deleted ({format_size(entry.size_bytes)}); its copy is {entry.archived}")
         except SessionError as error:
-            tell(error)
+            print_error(error)
             found.failed.append(entry.name)
-    total = size(sum(entry.size_bytes for entry in due))
-    _line("  none" if not due else f"{len(due)} sessions, {total}" + ("" if yes else "; --yes deletes them"))
+    total = format_size(sum(entry.size_bytes for entry in due))
+    _print_line("  none" if not due else f"{len(due)} sessions, {total}" + ("" if yes else "; --yes deletes them"))

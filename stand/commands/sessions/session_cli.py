@@ -19,19 +19,19 @@ from thermostand.foundation.exit_codes import FAILED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.instants import parse_instant
 from thermostand.foundation.items import Event, Item, StepMark
-from thermostand.foundation.output import json_line, output, say, show
-from thermostand.foundation.progress import Report, late_progress, progress
-from thermostand.foundation.usage import one_line
+from thermostand.foundation.output import get_output, json_line, say, show
+from thermostand.foundation.progress import Report, progress, show_late_progress
+from thermostand.foundation.usage import escape_line
 from thermostand.recording.exporting.export import export
-from thermostand.recording.exporting.one_file import export_mcap
+from thermostand.recording.exporting.mcap_export import export_mcap
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format.damage import FileDamaged
-from thermostand.recording.format.inventory import SegmentState, inventory
-from thermostand.recording.reading.overview import overview
+from thermostand.recording.format.inventory import SegmentState, list_segments
+from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.scan import Scan, scan, verify
 from thermostand.recording.reading.session import Session, check_whole
-from thermostand.recording.repair.salvage import Salvaged, salvage_line, salvage_session
+from thermostand.recording.repair.salvage import Salvaged, format_salvaged, salvage_session
 from thermostand.stand.commands.sessions.session_args import (
     IncompleteOption,
     OutOption,
@@ -39,7 +39,12 @@ from thermostand.stand.commands.sessions.session_args import (
     check_folder,
     check_session,
 )
-from thermostand.stand.commands.sessions.session_text import info_json, info_lines, verify_json, verify_lines
+from thermostand.stand.commands.sessions.session_text import (
+    format_info,
+    format_verification,
+    make_info_json,
+    make_verification_json,
+)
 
 app = App(
     no_args_is_help=True,
@@ -54,27 +59,27 @@ def info(directory: SessionArgument) -> None:
 
     Example: stand session info sessions/20260101T180000Z-thermal-cycle
     """
-    found = overview(check_session(directory))
-    if output().as_json:
-        show(info_json(found), ())
+    found = summarise_session(check_session(directory))
+    if get_output().as_json:
+        show(make_info_json(found), ())
     else:
-        show(None, info_lines(found))
+        show(None, format_info(found))
 
 
-def _sessions_in(directory: Path) -> list[Path]:
+def _find_sessions(directory: Path) -> list[Path]:
     """`directory` itself when it is a session, else those in it; ConfigError when there is no such folder."""
     check_folder(directory)
-    if inventory(directory):
+    if list_segments(directory):
         return [directory]
-    return [path for path in sorted(directory.iterdir()) if path.is_dir() and inventory(path)]
+    return [path for path in sorted(directory.iterdir()) if path.is_dir() and list_segments(path)]
 
 
 @contextmanager
-def _session_to_use(directory: Path, incomplete: bool) -> Generator[Session]:
+def _open_session(directory: Path, incomplete: bool) -> Generator[Session]:
     """The session in `directory` for a command that takes all of it. SessionError when something of it is missing or
     not finished, and not `incomplete`; what is being recorded is left out with a warning. Damage that the command meets
     becomes a sentence that says what helps."""
-    files = inventory(check_session(directory))
+    files = list_segments(check_session(directory))
     help_text = f"`stand session repair {directory}`"
     growing = [file.name for file in files if file.state is SegmentState.RECORDING]
     if growing:
@@ -98,18 +103,18 @@ def verify_session(directory: SessionArgument) -> None:
 
     Example: stand session verify sessions/20260101T180000Z-thermal-cycle
     """
-    files = inventory(check_session(directory))
+    files = list_segments(check_session(directory))
     total_bytes = sum(file.size_bytes for file in files if file.state is SegmentState.FINISHED)
-    with late_progress("verify", total_bytes) as report:
+    with show_late_progress("verify", total_bytes) as report:
         found = verify(directory, report)
-    show(verify_json(found), verify_lines(found))
+    show(make_verification_json(found), format_verification(found))
     if not found.is_sound:
         raise typer.Exit(FAILED)
 
 
-def _part_of(report: Report, done_bytes: int, size_bytes: int) -> Callable[[float, str], None]:
+def _make_part_report(report: Report, done_bytes: int, size_bytes: int) -> Callable[[float, str], None]:
     """Takes the share that is done of one session of that size, behind those before it."""
-    return lambda share, text: report(done_bytes + share * size_bytes, one_line(text))
+    return lambda share, text: report(done_bytes + share * size_bytes, escape_line(text))
 
 
 @app.command()
@@ -121,16 +126,16 @@ def repair(
 
     Example: stand session repair sessions
     """
-    sizes = {path: sum(file.size_bytes for file in inventory(path)) for path in _sessions_in(directory)}
+    sizes = {path: sum(file.size_bytes for file in list_segments(path)) for path in _find_sessions(directory)}
     done: list[Salvaged] = []
     done_bytes = 0
-    with late_progress("repair", sum(sizes.values())) as report:
+    with show_late_progress("repair", sum(sizes.values())) as report:
         for path, size_bytes in sizes.items():
-            for salvaged in salvage_session(path, _part_of(report, done_bytes, size_bytes)):
+            for salvaged in salvage_session(path, _make_part_report(report, done_bytes, size_bytes)):
                 done.append(salvaged)
             done_bytes += size_bytes
-    data = [{**asdict(each), "text": salvage_line(each)} for each in done]
-    show(data, [one_line(salvage_line(each)) for each in done] or ["nothing to repair"])
+    data = [{**asdict(each), "text": format_salvaged(each)} for each in done]
+    show(data, [escape_line(format_salvaged(each)) for each in done] or ["nothing to repair"])
     if any(salvaged.kept for salvaged in done):
         raise typer.Exit(FAILED)
 
@@ -147,11 +152,11 @@ def replay_session(
 
     Example: stand session replay sessions/20260101T180000Z-thermal-cycle --speed 60
     """
-    times = _speed(speed)
+    times = _parse_speed(speed)
     if record is not None:
         _check_new(record, directory)
     seen = scan(check_session(directory))
-    with _session_to_use(directory, incomplete) as session, _replay_progress(seen, session, record) as watch:
+    with _open_session(directory, incomplete) as session, _show_replay(seen, session, record) as watch:
         if record is None:
             asyncio.run(_replay(session, seen.begin_ns or 0, times, watch))
         else:
@@ -159,7 +164,7 @@ def replay_session(
             show({"session": recorded}, [recorded])
 
 
-def _speed(text: str) -> float | None:
+def _parse_speed(text: str) -> float | None:
     """Times as fast as it was; None is as fast as possible."""
     if text == "max":
         return None
@@ -177,7 +182,7 @@ def _check_new(out: Path, session: Path) -> None:
 
 
 @contextmanager
-def _replay_progress(seen: Scan, session: Session, record: Path | None) -> Generator[Callable[[Hub], None]]:
+def _show_replay(seen: Scan, session: Session, record: Path | None) -> Generator[Callable[[Hub], None]]:
     """Progress in seconds of the session; its steps and events as lines, in local time or as JSON."""
     begin_ns, end_ns, utc = seen.begin_ns or 0, seen.end_ns or 0, session.utc
     with progress("replay", (end_ns - begin_ns) / NS_PER_S) as report:
@@ -185,16 +190,16 @@ def _replay_progress(seen: Scan, session: Session, record: Path | None) -> Gener
         def follow(item: Item) -> None:
             at = utc.date_time(item.time_ns)
             report((item.time_ns - begin_ns) / NS_PER_S, at)
-            if output().as_json:
+            if get_output().as_json:
                 if record is None and isinstance(item, StepMark | Event):
                     typer.echo(json_line(item))
                 return
-            if output().quiet:
+            if get_output().quiet:
                 return
             if isinstance(item, StepMark):
-                typer.echo(f"{at}  step {item.index + 1} {one_line(item.kind)} {item.state}")
+                typer.echo(f"{at}  step {item.index + 1} {escape_line(item.kind)} {item.state}")
             elif isinstance(item, Event):
-                typer.echo(f"{at}  {one_line(f'{item.level} {item.kind}: {item.text}')}")
+                typer.echo(f"{at}  {escape_line(f'{item.level} {item.kind}: {item.text}')}")
 
         yield lambda hub: hub.subscribe(follow)
 
@@ -230,7 +235,7 @@ def export_session(
     Example: stand session export sessions/20260101T180000Z-thermal-cycle --out night --format parquet
     """
     _check_new(out, directory)
-    with _session_to_use(directory, incomplete) as session, late_progress("export", 1.0) as report:
+    with _open_session(directory, incomplete) as session, show_late_progress("export", 1.0) as report:
         if table_format == "mcap":
             export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
             show({"out": out}, [out])
@@ -256,23 +261,23 @@ def trim_session(
     """
     _check_new(out, directory)
     seen = scan(check_session(directory))
-    with _session_to_use(directory, incomplete) as session:
-        part = trim(session, out, *_range(begin, end, session, seen))
+    with _open_session(directory, incomplete) as session:
+        part = trim(session, out, *_parse_range(begin, end, session, seen))
         show({"session": part}, [part])
 
 
-def _range(begin: str, end: str | None, session: Session, seen: Scan) -> tuple[int, int]:
+def _parse_range(begin: str, end: str | None, session: Session, seen: Scan) -> tuple[int, int]:
     """From when up to when; ConfigError when that is not a time, or none."""
-    begin_ns = _instant(begin, session, seen)
+    begin_ns = _parse_instant(begin, session, seen)
     if seen.end_ns is not None and begin_ns > seen.end_ns:
         raise ConfigError(f"--from {begin} is after the session's end ({session.utc.local_text(seen.end_ns)})")
-    end_ns = (seen.end_ns or 0) + 1 if end is None else _instant(end, session, seen)
+    end_ns = (seen.end_ns or 0) + 1 if end is None else _parse_instant(end, session, seen)
     if end_ns <= begin_ns:
         raise ConfigError(f"--to {end} is not after --from {begin}")
     return begin_ns, end_ns
 
 
-def _instant(text: str, session: Session, seen: Scan) -> int:
+def _parse_instant(text: str, session: Session, seen: Scan) -> int:
     """ns since the epoch; ConfigError when the text is no time, or names no step of the session."""
     step = re.fullmatch(r"step:(\d+)", text)
     if step is None:

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from thermostand.foundation.usage import Lazy, lazy_app
+from thermostand.foundation.usage import LazyCommand, make_lazy_app
 
 _LIST, _WORK = "thermostand.stand.commands.sessions.session_list_cli", "thermostand.stand.commands.sessions.session_cli"
 
-app = lazy_app(
+app = make_lazy_app(
     "Recorded sessions: list, look at, verify, repair, replay, export, trim.\n\n"
     "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
     {
-        "list": Lazy(_LIST, "The sessions in a folder: when, how long, how they ended, tags and notes."),
-        "note": Lazy(_LIST, "Add a note to a session, also while it runs."),
-        "tag": Lazy(_LIST, "Give a session tags, or take them away."),
-        "archive": Lazy(
+        "list": LazyCommand(_LIST, "The sessions in a folder: when, how long, how they ended, tags and notes."),
+        "note": LazyCommand(_LIST, "Add a note to a session, also while it runs."),
+        "tag": LazyCommand(_LIST, "Give a session tags, or take them away."),
+        "archive": LazyCommand(
             "thermostand.stand.commands.sessions.session_archive_cli",
             "Copy finished sessions to another disk, read back.",
         ),
-        "info": Lazy(_WORK, "What a session holds: when, steps, frames, gaps, temperatures, events, versions."),
-        "verify": Lazy(_WORK, "Read every byte of a session and say what is damaged or missing."),
-        "repair": Lazy(_WORK, "Finish unfinished segments and repair damaged ones."),
-        "replay": Lazy(_WORK, "Publish a session again, at its own pace or faster."),
-        "export": Lazy(_WORK, "A session as images, tables or one file for a viewer."),
-        "trim": Lazy(_WORK, "A part of a session as a new one."),
+        "info": LazyCommand(_WORK, "What a session holds: when, steps, frames, gaps, temperatures, events, versions."),
+        "verify": LazyCommand(_WORK, "Read every byte of a session and say what is damaged or missing."),
+        "repair": LazyCommand(_WORK, "Finish unfinished segments and repair damaged ones."),
+        "replay": LazyCommand(_WORK, "Publish a session again, at its own pace or faster."),
+        "export": LazyCommand(_WORK, "A session as images, tables or one file for a viewer."),
+        "trim": LazyCommand(_WORK, "A part of a session as a new one."),
     },
 )

@@ -15,13 +15,19 @@ from typing import Annotated
 import typer
 
 from thermostand.foundation.command_app import App
-from thermostand.foundation.output import output, say, show
-from thermostand.foundation.usage import one_line
-from thermostand.recording.format.inventory import inventory
-from thermostand.recording.reading.catalogue import ListedSession, Report, catalogue, look_at
+from thermostand.foundation.output import get_output, say, show
+from thermostand.foundation.usage import escape_line
+from thermostand.recording.format.inventory import list_segments
+from thermostand.recording.reading.catalogue import ListedSession, Report, load_catalogue, look_at
 from thermostand.recording.reading.notes import add_note, add_tags, check_tag, read_notes
 from thermostand.stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
-from thermostand.stand.commands.sessions.session_table import ON_THE_RIGHT, entry_json, fitting, lines, rows
+from thermostand.stand.commands.sessions.session_table import (
+    ON_THE_RIGHT,
+    fit_columns,
+    format_lines,
+    make_entry_json,
+    make_rows,
+)
 
 app = App(no_args_is_help=True)
 _USUAL = {"run": ("complete", "running"), "files": ("sound",)}  # anything else is shown in another colour
@@ -41,32 +47,32 @@ def list_sessions(
     Example: stand session list /data/sessions --tag paper
     """
     wanted = set(map(check_tag, tag or ()))
-    seen = [entry for entry in sessions_at(check_folder(directory)) if wanted <= set(entry.tags)]
+    seen = [entry for entry in list_sessions_at(check_folder(directory)) if wanted <= set(entry.tags)]
     seen = [entry for entry in seen if not (not_archived and entry.archived)]
-    if output().as_json:
-        show([entry_json(entry) for entry in seen], ())
+    if get_output().as_json:
+        show([make_entry_json(entry) for entry in seen], ())
     elif not seen:
         with_tag = f" with the tag {', '.join(sorted(wanted))}" if wanted else ""
         say(f"{directory}: no sessions{with_tag} there")
     elif sys.stdout.isatty():
         _show_table(seen)
     else:
-        typer.echo("\n".join(lines(*rows(seen))))
+        typer.echo("\n".join(format_lines(*make_rows(seen))))
 
 
-def sessions_at(directory: Path) -> list[ListedSession]:
+def list_sessions_at(directory: Path) -> list[ListedSession]:
     """`directory` itself when it is a session, else those in it."""
-    if inventory(directory):
+    if list_segments(directory):
         return [look_at(directory)]
     with ExitStack() as stack:
 
         def progress(count: int) -> Report:
-            from thermostand.foundation.progress import late_progress
+            from thermostand.foundation.progress import show_late_progress
 
-            report = stack.enter_context(late_progress("look at sessions", count))
-            return lambda done, text: report(done, one_line(text))
+            report = stack.enter_context(show_late_progress("look at sessions", count))
+            return lambda done, text: report(done, escape_line(text))
 
-        return catalogue(directory, progress)
+        return load_catalogue(directory, progress)
 
 
 def _show_table(seen: list[ListedSession]) -> None:
@@ -75,7 +81,7 @@ def _show_table(seen: list[ListedSession]) -> None:
     from rich.text import Text
 
     console = Console()
-    columns, cells, left_out = fitting(*rows(seen), console.width)
+    columns, cells, left_out = fit_columns(*make_rows(seen), console.width)
     table = Table(box=None, pad_edge=False)
     for column in columns:
         is_name = column == columns[0]
@@ -101,7 +107,7 @@ def note(
 
     Example: stand session note sessions/20260101T180000Z-thermal-cycle "door opened at 19:10"
     """
-    _keep(directory, partial(add_note, text=" ".join(text)))
+    _save(directory, partial(add_note, text=" ".join(text)))
 
 
 @app.command()
@@ -114,20 +120,20 @@ def tag(
 
     Example: stand session tag sessions/20260101T180000Z-thermal-cycle paper lens-B
     """
-    _keep(directory, partial(add_tags, tags=tags, remove=remove))
+    _save(directory, partial(add_tags, tags=tags, remove=remove))
 
 
-def _keep(directory: Path, add: Callable[..., None]) -> None:
+def _save(directory: Path, add: Callable[..., None]) -> None:
     from thermostand.foundation.clock import WallClock
 
-    add(check_session(directory), by=user_name(), time_ns=WallClock().now_ns())
-    said = read_notes(directory)
-    count = f"{len(said.notes)} note{'' if len(said.notes) == 1 else 's'}"
-    line = one_line(f"{directory}: {count}, tags: {', '.join(said.tags) or 'none'}")
-    show({"notes": [asdict(each) for each in said.notes], "tags": list(said.tags)}, [line])
+    add(check_session(directory), by=get_user_name(), time_ns=WallClock().now_ns())
+    text = read_notes(directory)
+    count = f"{len(text.notes)} note{'' if len(text.notes) == 1 else 's'}"
+    line = escape_line(f"{directory}: {count}, tags: {', '.join(text.tags) or 'none'}")
+    show({"notes": [asdict(each) for each in text.notes], "tags": list(text.tags)}, [line])
 
 
-def user_name() -> str:
+def get_user_name() -> str:
     """Of who gives the command."""
     try:
         return pwd.getpwuid(os.getuid()).pw_name

@@ -8,31 +8,31 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 
-from thermostand.foundation.instants import duration, local_text
+from thermostand.foundation.instants import format_duration, format_local
 from thermostand.foundation.items import Event, StepState
-from thermostand.foundation.usage import one_line
+from thermostand.foundation.usage import escape_line
 from thermostand.recording.format.inventory import SegmentState
 from thermostand.recording.format.utc_offsets import UtcOffsets
-from thermostand.recording.reading.catalogue import ListedSession, entry_of
+from thermostand.recording.reading.catalogue import ListedSession, make_entry
 from thermostand.recording.reading.overview import ChannelRange, FramesSummary, Overview, RunStep
-from thermostand.recording.reading.run_word import Files
+from thermostand.recording.reading.run_status import Files
 from thermostand.recording.reading.scan import Scan
-from thermostand.stand.commands.sessions.session_table import entry_json, size
+from thermostand.stand.commands.sessions.session_table import format_size, make_entry_json
 
 WIDTH = 100
 _LABEL = 14
 _MOST = 20  # entries of a list before the rest is only counted
 
 
-def info_lines(found: Overview) -> Iterator[str]:
+def format_info(found: Overview) -> Iterator[str]:
     """`stand session info`."""
     utc = found.scanned.utc
     parts = (
-        _facts(found, utc),
-        _steps(found, utc),
-        _frames(found, utc),
+        _format_facts(found, utc),
+        _format_steps(found, utc),
+        _format_frames(found, utc),
         _channels(found.channels),
-        (*_gaps(found, utc), *_events(found.events, utc)),
+        (*_format_gaps(found, utc), *_format_events(found.events, utc)),
     )
     for position, part in enumerate(parts):
         if position:
@@ -40,93 +40,95 @@ def info_lines(found: Overview) -> Iterator[str]:
         yield from part
 
 
-def _entry(found: Overview) -> ListedSession:
+def _make_entry(found: Overview) -> ListedSession:
     """As the list has it, with the steps of the system clock in between."""
     seen, utc = found.scanned, found.scanned.utc
     start_ns = None if seen.begin_ns is None else utc.utc_ns(seen.begin_ns)
     end_ns = None if seen.end_ns is None else utc.utc_ns(seen.end_ns)
-    return replace(entry_of(seen), start_ns=start_ns, end_utc_ns=end_ns)
+    return replace(make_entry(seen), start_ns=start_ns, end_utc_ns=end_ns)
 
 
-def _instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
+def _format_instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
     return None if time_ns is None else utc.utc_text(time_ns)
 
 
-def _row(label: str, text: str) -> Iterator[str]:
+def _format_row(label: str, text: str) -> Iterator[str]:
     """A label and its text, wrapped beside it; a path stays whole, to be copied."""
     wrapper = textwrap.TextWrapper(
         WIDTH, f"{label:<{_LABEL}}", " " * _LABEL, break_long_words=False, break_on_hyphens=False
     )
-    yield from wrapper.wrap(one_line(text))
+    yield from wrapper.wrap(escape_line(text))
 
 
-def _facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+def _format_facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     seen = found.scanned
     stated = seen.metadata.get
     name, known_as = seen.path.resolve().name, stated("session_id", "")
     alias = f", recorded as {known_as}" if known_as not in ("", name) else ""
-    yield from _row("session", f"{name}{alias}")
-    yield from _row("run", str(seen.run))
-    yield from _row("files", str(found.scanned.files))
-    yield from _row("recipe", stated("recipe", "?") + (", simulated devices" if seen.simulated else ""))
+    yield from _format_row("session", f"{name}{alias}")
+    yield from _format_row("run", str(seen.run))
+    yield from _format_row("files", str(found.scanned.files))
+    yield from _format_row("recipe", stated("recipe", "?") + (", simulated devices" if seen.simulated else ""))
     if seen.begin_ns is not None and seen.end_ns is not None:
         span = f"{utc.date_time(seen.begin_ns)} to {utc.local_text(seen.end_ns)}"
-        yield from _row(
-            "recorded", f"{span}, {duration(seen.end_ns - seen.begin_ns)}, {stated('clock_source', '?')} clock"
+        yield from _format_row(
+            "recorded", f"{span}, {format_duration(seen.end_ns - seen.begin_ns)}, {stated('clock_source', '?')} clock"
         )
     ending = "not recorded" if found.ending is None else found.ending.text
-    yield from _row("ended", ending)
-    yield from _row("operator", stated("operator", "") or "not named")
-    yield from _row("camera", stated("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
+    yield from _format_row("ended", ending)
+    yield from _format_row("operator", stated("operator", "") or "not named")
+    yield from _format_row("camera", stated("camera_serial", "?") + (f"; {seen.lacks}" if seen.lacks else ""))
     host = f", host {stated('host')}" if stated("host") else ""
-    yield from _row("software", f"thermostand {stated('software_version', '?')}{host}")
-    yield from _row("segments", _segments(seen))
-    yield from _row("attached", ", ".join(seen.attachments) or "nothing")
-    yield from _said(entry_of(seen))
-    for trouble in _limited(found.scanned.sentences(Files.DAMAGED)):
-        yield from _row("damaged", trouble)
-    for text in _limited(seen.sentences(Files.INCOMPLETE)):
-        yield from _row("missing", text)
+    yield from _format_row("software", f"thermostand {stated('software_version', '?')}{host}")
+    yield from _format_row("segments", _format_segments(seen))
+    yield from _format_row("attached", ", ".join(seen.attachments) or "nothing")
+    yield from _format_notes(make_entry(seen))
+    for trouble in _limit(found.scanned.sentences(Files.DAMAGED)):
+        yield from _format_row("damaged", trouble)
+    for text in _limit(seen.sentences(Files.INCOMPLETE)):
+        yield from _format_row("missing", text)
     if found.scanned.sentences(Files.DAMAGED) or seen.count(SegmentState.UNFINISHED):
-        yield from _row("to do", f"stand session repair {seen.path}")
+        yield from _format_row("to do", f"stand session repair {seen.path}")
 
 
-def _said(entry: ListedSession) -> Iterator[str]:
+def _format_notes(entry: ListedSession) -> Iterator[str]:
     """What people said of the session, and where a copy is."""
     if entry.tags:
-        yield from _row("tags", ", ".join(entry.tags))
-    for text in _limited([f"{local_text(note.time_ns)} {note.by}: {note.text}" for note in entry.notes]):
-        yield from _row("note", text)
-    yield from _row("archived", entry.archived or ("not as it is now" if entry.copies else "not yet"))
+        yield from _format_row("tags", ", ".join(entry.tags))
+    for text in _limit([f"{format_local(note.time_ns)} {note.by}: {note.text}" for note in entry.notes]):
+        yield from _format_row("note", text)
+    yield from _format_row("archived", entry.archived or ("not as it is now" if entry.copies else "not yet"))
 
 
-def _segments(seen: Scan) -> str:
+def _format_segments(seen: Scan) -> str:
     by_series: dict[str, list[int]] = {}
     for file in seen.inventory:
         if file.state is SegmentState.FINISHED:
             by_series.setdefault(file.series, []).append(file.size_bytes)
-    parts = [f"{series} {len(sizes)} ({size(sum(sizes))})" for series, sizes in by_series.items()]
+    parts = [f"{series} {len(sizes)} ({format_size(sum(sizes))})" for series, sizes in by_series.items()]
     others = [
-        f"{file.name} is {file.state} ({size(file.size_bytes)})"
+        f"{file.name} is {file.state} ({format_size(file.size_bytes)})"
         for file in seen.inventory
         if file.state is not SegmentState.FINISHED
     ]
-    return "; ".join([", ".join(parts) or "none finished", *_limited(others)])
+    return "; ".join([", ".join(parts) or "none finished", *_limit(others)])
 
 
-def _limited(entries: Sequence[str]) -> list[str]:
+def _limit(entries: Sequence[str]) -> list[str]:
     """The first entries and how many more there are."""
     more = len(entries) - _MOST
     return [*entries[:_MOST], *([f"and {more} more"] if more > 0 else [])]
 
 
-def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+def _format_steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     """Finished steps are counted against the plan, not against those that were begun."""
     steps = found.steps
     kinds = Counter(step.kind for step in steps if step.state is StepState.DONE)
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
     planned = "" if found.planned_steps is None else f" of {found.planned_steps}"
-    yield from _row("steps", f"{kinds.total()}{planned} done{f': {listed}' if listed else ''}" if steps else "none")
+    yield from _format_row(
+        "steps", f"{kinds.total()}{planned} done{f': {listed}' if listed else ''}" if steps else "none"
+    )
     stated = {
         StepState.FAILED: "failed",
         StepState.SKIPPED: "was left out",
@@ -137,23 +139,23 @@ def _steps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
             parameters = " ".join(f"{name}={value}" for name, value in step.parameters.items())
             begun = f"begun {utc.local_text(step.begin_ns)}"
             text = f"{step.index} {step.kind} {parameters} {stated[step.state]}, {begun}"
-            yield from _row("  not done", text)
+            yield from _format_row("  not done", text)
 
 
-def _frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+def _format_frames(found: Overview, utc: UtcOffsets) -> Iterator[str]:
     frames = found.frames
     if not frames.count:
-        yield from _row("frames", f"none{_lost(frames)}")
+        yield from _format_row("frames", f"none{_format_losses(frames)}")
         return
-    each = size(round(frames.size_bytes / frames.count))
-    yield from _row("frames", f"{frames.count}, {frames.pixels}, {each} each{_lost(frames)}")
+    each = format_size(round(frames.size_bytes / frames.count))
+    yield from _format_row("frames", f"{frames.count}, {frames.pixels}, {each} each{_format_losses(frames)}")
     if frames.first_ns is not None and frames.last_ns is not None:
-        yield from _row("", f"from {utc.date_time(frames.first_ns)} to {utc.local_text(frames.last_ns)}")
+        yield from _format_row("", f"from {utc.date_time(frames.first_ns)} to {utc.local_text(frames.last_ns)}")
     captures = [step for step in found.steps if step.frames]
-    yield from _limited([_capture(step, utc) for step in captures])
+    yield from _limit([_format_capture(step, utc) for step in captures])
 
 
-def _lost(frames: FramesSummary) -> str:
+def _format_losses(frames: FramesSummary) -> str:
     parts: list[str] = []
     if frames.dropped:
         parts.append(f"{frames.dropped} lost by the camera or its wire")
@@ -163,7 +165,7 @@ def _lost(frames: FramesSummary) -> str:
     return "".join(f"; {part}" for part in parts)
 
 
-def _capture(step: RunStep, utc: UtcOffsets) -> str:
+def _format_capture(step: RunStep, utc: UtcOffsets) -> str:
     stated = " ".join(f"{name}={step.parameters[name]}" for name in ("role", "chamber_degC") if name in step.parameters)
     asked = step.parameters.get("frames", "?")
     begun = utc.date_time(step.begin_ns)
@@ -172,9 +174,9 @@ def _capture(step: RunStep, utc: UtcOffsets) -> str:
 
 def _channels(channels: Sequence[ChannelRange]) -> Iterator[str]:
     if not channels:
-        yield from _row("readings", "none")
+        yield from _format_row("readings", "none")
         return
-    names = [one_line(f"{row.channel} {row.unit}" if row.unit not in ("", "1") else row.channel) for row in channels]
+    names = [escape_line(f"{row.channel} {row.unit}" if row.unit not in ("", "1") else row.channel) for row in channels]
     width = max(map(len, names))
     yield f"{'readings':<{_LABEL}}{'':<{width}}{'min':>9}{'mean':>9}{'max':>9}{'readings':>10}{'BAD':>8}"
     for name, row in zip(names, channels, strict=True):
@@ -183,63 +185,63 @@ def _channels(channels: Sequence[ChannelRange]) -> Iterator[str]:
         yield f"{'':<{_LABEL}}{name:<{width}}{numbers}{row.count:>10}{row.bad:>8}"
 
 
-def _gaps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
-    for position, gap in enumerate(_limited([gap.text(utc) for gap in found.gaps]) or ["none"]):
-        yield from _row("" if position else "gaps", gap)
+def _format_gaps(found: Overview, utc: UtcOffsets) -> Iterator[str]:
+    for position, gap in enumerate(_limit([gap.text(utc) for gap in found.gaps]) or ["none"]):
+        yield from _format_row("" if position else "gaps", gap)
 
 
-def _events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
+def _format_events(events: Sequence[Event], utc: UtcOffsets) -> Iterator[str]:
     counts = Counter(event.level for event in events)
-    yield from _row("events", ", ".join(f"{count} {level}" for level, count in sorted(counts.items())) or "none")
+    yield from _format_row("events", ", ".join(f"{count} {level}" for level, count in sorted(counts.items())) or "none")
     grave = [event for event in events if event.level != "info"]
-    for line in _limited([f"{utc.date_time(event.time_ns)} {event.level}: {event.text}" for event in grave]):
-        yield from _row("", line)
+    for line in _limit([f"{utc.date_time(event.time_ns)} {event.level}: {event.text}" for event in grave]):
+        yield from _format_row("", line)
 
 
-def info_json(found: Overview) -> dict[str, object]:
+def make_info_json(found: Overview) -> dict[str, object]:
     """`stand session info --json`: everything, lists in full; null for min, mean and max of a channel that was never
-    good. Instants are as in entry_json."""
+    good. Instants are as in make_entry_json."""
     utc = found.scanned.utc
     return {
-        **entry_json(_entry(found)),
+        **make_entry_json(_make_entry(found)),
         "files": str(found.scanned.files),
         "troubles": list(found.scanned.sentences(Files.DAMAGED)),
         "planned_steps": found.planned_steps,
         "attachments": list(found.scanned.attachments),
         "ending": None if found.ending is None else found.ending.text,
         "steps": [
-            {**asdict(step), "begin": _instant(step.begin_ns, utc), "end": _instant(step.end_ns, utc)}
+            {**asdict(step), "begin": _format_instant(step.begin_ns, utc), "end": _format_instant(step.end_ns, utc)}
             for step in found.steps
         ],
         "images": {
             **asdict(found.frames),
-            "first": _instant(found.frames.first_ns, utc),
-            "last": _instant(found.frames.last_ns, utc),
+            "first": _format_instant(found.frames.first_ns, utc),
+            "last": _format_instant(found.frames.last_ns, utc),
         },
         "channels": [
             {name: None if value != value else value for name, value in asdict(channel).items()}
             for channel in found.channels
         ],
         "gaps": [
-            {**asdict(gap), "begin": _instant(gap.begin_ns, utc), "end": _instant(gap.end_ns, utc)}
+            {**asdict(gap), "begin": _format_instant(gap.begin_ns, utc), "end": _format_instant(gap.end_ns, utc)}
             for gap in found.gaps
         ],
-        "events": [{**asdict(event), "time": _instant(event.time_ns, utc)} for event in found.events],
+        "events": [{**asdict(event), "time": _format_instant(event.time_ns, utc)} for event in found.events],
     }
 
 
-def verify_lines(found: Scan) -> Iterator[str]:
+def format_verification(found: Scan) -> Iterator[str]:
     """`stand session verify`: the findings, then what was read."""
-    yield from map(one_line, map(str, found.findings))
+    yield from map(escape_line, map(str, found.findings))
     errors = sum(finding.severity == "error" for finding in found.findings)
     count = f" ({errors} {'error' if errors == 1 else 'errors'})" if errors else ""
     yield (
         f"files {found.files}{count}; run {found.run}; {found.segments} segments, {found.messages} messages, "
-        f"{found.frames} frames, {size(found.bytes)} read"
+        f"{found.frames} frames, {format_size(found.bytes)} read"
     )
 
 
-def verify_json(found: Scan) -> dict[str, object]:
+def make_verification_json(found: Scan) -> dict[str, object]:
     """`stand session verify --json`."""
     counts = {name: getattr(found, name) for name in ("segments", "messages", "frames", "bytes")}
     findings = [asdict(finding) for finding in found.findings]

@@ -7,17 +7,17 @@ Rows are read from the top; the first that fits decides:
     its next frame is not due yet                            Sleep
     something holds the run                                  Wait
     the soak under way has earned its time                   Complete
-    the set-up is disturbed; a warm-up was interrupted       StartCold
+    the set-up is disturbed; a warm-up was interrupted       RestartCold
     the set-up is disturbed                                  Restore
     a soak since the last set-point owes time                Earn
     the camera, which the step needs, is not in equilibrium  Equilibrate
-    the flap should be open and is not                       OpenAgain
+    the flap should be open and is not                       ReopenFlap
     the step was not begun by this daemon                    Begin
     the step is a soak                                       Earn
-    it is a capture: the disk lost some of its frames        TakeAgain
+    it is a capture: the disk lost some of its frames        Retake
     ... without a deadline, or after a hold                  Aim
-    ... a warm-up, and it was interrupted for long           StartCold
-    ... with frames, and it was interrupted for long         TakeAgain
+    ... a warm-up, and it was interrupted for long           RestartCold
+    ... with frames, and it was interrupted for long         Retake
     ... else                                                 TakeFrame
     any other step                                           Perform
 """
@@ -28,7 +28,7 @@ import math
 from dataclasses import dataclass
 
 from thermostand.experiments.steps import AnySoak, Capture, CloseFlap, OpenFlap, PlannedStep, PowerCamera, Prompt, Role
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.stand.running.memory.state import Plan, RunState, SetUp
 
 # A soak is credited after an interruption when the chamber is this near to its set-point: regulators hold 0.1 K, and a
@@ -37,9 +37,9 @@ CREDITED_WITHIN_K = 1.0
 # A capture that was interrupted for longer than this is taken again: its flap was shut meanwhile, and the air is not
 # the same any more.
 # Round number; nothing was measured.
-AGAIN_AFTER_S = 60.0
+RETAKE_AFTER_S = 60.0
 # A disk that loses frames each time must not hold the night for good.
-AGAIN_FOR_LOST_FRAMES = 3
+MOST_RETAKES_FOR_LOST_FRAMES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Wait:
 
 
 @dataclass(frozen=True, slots=True)
-class StartCold:
+class RestartCold:
     """These steps of a warm-up, its capture last, are done again."""
 
     again: Plan
@@ -91,7 +91,7 @@ class Restore:
 
 
 @dataclass(frozen=True, slots=True)
-class Earn:
+class ContinueSoak:
     """Soak for what the soak still owes."""
 
     soak: PlannedStep
@@ -103,7 +103,7 @@ class Equilibrate:
 
 
 @dataclass(frozen=True, slots=True)
-class OpenAgain:
+class ReopenFlap:
     """Open the flap, which was shut in a hold."""
 
 
@@ -115,14 +115,14 @@ class Begin:
 
 
 @dataclass(frozen=True, slots=True)
-class Aim:
+class ArmCapture:
     """Prepare for frames, and say when the next is due."""
 
     capture: Capture
 
 
 @dataclass(frozen=True, slots=True)
-class TakeAgain:
+class Retake:
     """The capture is restarted; why: as a clause. frames_lost: by the disk, when it is for them."""
 
     planned: PlannedStep
@@ -151,43 +151,43 @@ Action = (
     Complete
     | Sleep
     | Wait
-    | StartCold
+    | RestartCold
     | Restore
-    | Earn
+    | ContinueSoak
     | Equilibrate
-    | OpenAgain
+    | ReopenFlap
     | Begin
-    | Aim
-    | TakeAgain
+    | ArmCapture
+    | Retake
     | TakeFrame
     | Perform
 )
 # Of these the outage of a capture is made. Soaks that come before the step count, too.
-Readies = Wait | Restore | Equilibrate | OpenAgain
+PreparingAction = Wait | Restore | Equilibrate | ReopenFlap
 
 
-def next_action(state: RunState, around: Surroundings) -> Action | None:
+def choose_next_action(state: RunState, around: Surroundings) -> Action | None:
     """The action, None when the plan is done."""
     if state.index >= len(state.plan):
         return None
     planned = state.plan[state.index]
     is_under_way = state.under_way == planned.step_id
     step = planned.step
-    if is_under_way and has_all_frames(state, planned) and not is_lossy(state, around, planned):
+    if is_under_way and has_all_frames(state, planned) and not needs_retake(state, around, planned):
         return Complete(planned)
     if is_under_way and state.due_ns is not None and around.now_ns < state.due_ns - around.lead_ns:
         return Sleep(state.due_ns - around.lead_ns)
     if around.held:
         return Wait()
-    if is_under_way and isinstance(step, AnySoak) and not state.owed_ns(planned):
+    if is_under_way and isinstance(step, AnySoak) and not state.remaining_ns(planned):
         return Complete(planned)
-    if action := _readying(state, around, planned):
+    if action := _find_preparation(state, around, planned):
         return action
     if not is_under_way:
         return Begin(planned)
     if isinstance(step, Capture):
-        return _capturing(state, around, planned, step)
-    return Earn(planned) if isinstance(step, AnySoak) else Perform(planned)
+        return _choose_capture_action(state, around, planned, step)
+    return ContinueSoak(planned) if isinstance(step, AnySoak) else Perform(planned)
 
 
 def has_all_frames(state: RunState, planned: PlannedStep) -> bool:
@@ -195,65 +195,65 @@ def has_all_frames(state: RunState, planned: PlannedStep) -> bool:
     return isinstance(planned.step, Capture) and state.frames.get(planned.step_id, 0) >= planned.step.frames
 
 
-def is_lossy(state: RunState, around: Surroundings, planned: PlannedStep) -> bool:
+def needs_retake(state: RunState, around: Surroundings, planned: PlannedStep) -> bool:
     """Whether the capture, which has all its frames, is taken again because the disk has lost some; not one of a camera
     that has warmed up meanwhile."""
     if not around.frames_lost or not isinstance(planned.step, Capture) or planned.step.role is Role.WARM_UP:
         return False
-    has_tries = state.taken_again.get(planned.step_id, 0) < AGAIN_FOR_LOST_FRAMES
+    has_tries = state.retakes.get(planned.step_id, 0) < MOST_RETAKES_FOR_LOST_FRAMES
     return has_tries and has_all_frames(state, planned)
 
 
-def _readying(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
+def _find_preparation(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
     """What is needed before the step; None when everything is as the steps before it have left it."""
     set_up = state.set_up
-    if state.is_disturbed:
-        if again := cold_start(state):
-            return StartCold(again)
+    if state.is_setup_invalid:
+        if again := find_cold_start_steps(state):
+            return RestartCold(again)
         # A soak depends on what it has earned itself as on those before it.
         return Restore(set_up.after(planned) if isinstance(planned.step, AnySoak) else set_up)
-    if owing := next((soak for soak in set_up.soaks if state.owed_ns(soak)), None):
-        return Earn(owing)
+    if owing := next((soak for soak in set_up.soaks if state.remaining_ns(soak)), None):
+        return ContinueSoak(owing)
     if set_up.camera_on and around.lost_equilibrium and isinstance(planned.step, OpenFlap | Capture):
         return Equilibrate()
     if set_up.flap_open and not around.flap_open and not isinstance(planned.step, CloseFlap):
-        return OpenAgain()
+        return ReopenFlap()
     return None
 
 
-def _capturing(state: RunState, around: Surroundings, planned: PlannedStep, capture: Capture) -> Action:
+def _choose_capture_action(state: RunState, around: Surroundings, planned: PlannedStep, capture: Capture) -> Action:
     if has_all_frames(state, planned):
-        return TakeAgain(planned, f"the disk has lost {around.frames_lost} of its frames", around.frames_lost)
+        return Retake(planned, f"the disk has lost {around.frames_lost} of its frames", around.frames_lost)
     if state.due_ns is None or state.readying or state.is_lost:
-        return Aim(capture)
+        return ArmCapture(capture)
     outage_ns, has_frames = state.outage_ns(around.now_ns), state.frames.get(planned.step_id, 0) > 0
     is_warm_up = capture.role is Role.WARM_UP
-    if outage_ns > seconds_ns(AGAIN_AFTER_S):
-        if is_warm_up and (again := cold_start(state)):
-            return StartCold(again)
+    if outage_ns > to_ns(RETAKE_AFTER_S):
+        if is_warm_up and (again := find_cold_start_steps(state)):
+            return RestartCold(again)
         if has_frames:
-            return TakeAgain(planned, f"it was interrupted for {outage_ns / NS_PER_S:.0f} s")
+            return Retake(planned, f"it was interrupted for {outage_ns / NS_PER_S:.0f} s")
     may_settle = bool(state.set_up.soaks) and capture.role not in (Role.WARM_UP, Role.OTHER)
     return TakeFrame(planned, capture, state.due_ns, may_settle and not has_frames)
 
 
-def next_due_ns(due_ns: int | None, capture: Capture, around: Surroundings, *, is_lost: bool) -> int:
+def compute_next_due_ns(due_ns: int | None, capture: Capture, around: Surroundings, *, is_lost: bool) -> int:
     """When the next frame is due after the capture was made ready, on a grid of absolute deadlines: those missed while
     the run was held or a lost camera reopened are skipped, not made up for by a burst."""
     if due_ns is None:
         return around.now_ns + around.lead_ns
-    interval_ns = seconds_ns(capture.interval_s)
+    interval_ns = to_ns(capture.interval_s)
     return due_ns + max(is_lost, math.ceil((around.now_ns - due_ns) / interval_ns)) * interval_ns
 
 
-def due_after_ns(due_ns: int, capture: Capture, now_ns: int) -> int:
+def compute_due_after_ns(due_ns: int, capture: Capture, now_ns: int) -> int:
     """When the next frame is due after one: at the latest deadline that has passed, for a free-running camera gives its
     frame up to a period late."""
-    interval_ns = seconds_ns(capture.interval_s)
+    interval_ns = to_ns(capture.interval_s)
     return due_ns + max(1, (now_ns - due_ns) // interval_ns) * interval_ns
 
 
-def cold_start(state: RunState) -> Plan:
+def find_cold_start_steps(state: RunState) -> Plan:
     """The steps of an interrupted warm-up that are done again, the capture last: from switching the camera off to its
     capture, but for what the operator was asked for. A warm-up that was killed, or held by an interlock, cannot be gone
     on with: its camera is warm.
@@ -262,8 +262,8 @@ def cold_start(state: RunState) -> Plan:
     """
     steps = state.plan
     last = next((step.index for step in steps if _is_warm_up(step) and step.step_id not in state.done), 0)
-    on = _last_switch(steps[:last], on=True)
-    off = _last_switch(steps[: on or 0], on=False)
+    on = _find_last_switch(steps[:last], on=True)
+    off = _find_last_switch(steps[: on or 0], on=False)
     if on is None or off is None or steps[on].step_id not in state.done | state.begun:
         return ()
     return tuple(step for step in steps[off : last + 1] if not isinstance(step.step, Prompt))
@@ -273,12 +273,12 @@ def _is_warm_up(planned: PlannedStep) -> bool:
     return isinstance(planned.step, Capture) and planned.step.role is Role.WARM_UP
 
 
-def _last_switch(steps: Plan, *, on: bool) -> int | None:
+def _find_last_switch(steps: Plan, *, on: bool) -> int | None:
     return next((step.index for step in reversed(steps) if step.step == PowerCamera(on)), None)
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
+class SoakCredit:
     """What the soaks that were begun are worth after a disturbance; `lost` are soaked again. text: why, "" when
     there was nothing to lose."""
 
@@ -286,15 +286,15 @@ class Worth:
     lost: Plan = ()
 
 
-def worth_of_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> Worth:
+def credit_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> SoakCredit:
     """Soaks since the last set-point keep what they have earned only if the chamber is in its band, and the camera was
     on."""
-    begun = tuple(soak for soak in set_up.soaks if soak.step_id in state.done or state.earned_ns.get(soak.step_id, 0))
+    begun = tuple(soak for soak in set_up.soaks if soak.step_id in state.done or state.soaked_ns.get(soak.step_id, 0))
     if not begun or set_up.chamber_degC is None:
-        return Worth()
+        return SoakCredit()
     if state.is_cold and set_up.camera_on:
-        return Worth("the camera was or may have been off", begun)
+        return SoakCredit("the camera was or may have been off", begun)
     text = f"the chamber is at {around.pv_degC:.2f} degC, {{}}within {CREDITED_WITHIN_K:g} K of its set-point"
     if abs(around.pv_degC - set_up.chamber_degC) <= CREDITED_WITHIN_K:
-        return Worth(text.format(""))
-    return Worth(text.format("not "), begun)
+        return SoakCredit(text.format(""))
+    return SoakCredit(text.format("not "), begun)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from thermostand.foundation.clock import NS_PER_S, Clock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.events import (
     CAMERA_EQUILIBRIUM,
     CAMERA_EQUILIBRIUM_LOST,
@@ -64,27 +64,29 @@ class OffsetWatch:
         """Listen no more: the run is over."""
         self._hub.unsubscribe(self._receive)
 
-    def settled(self, chamber_degC: float) -> None:
+    def note_settled(self, chamber_degC: float) -> None:
         """The set-point has settled: keep its offset, and compare it when it is the first since a gap; the event
         `camera_offset_changed`, or `camera_offset_same`."""
-        after_K = self._offset_K()
+        after_K = self._compute_offset_K()
         if math.isnan(after_K):
             return
         gap, before_K = self._gap, self._settled_K
         if gap is not None and before_K:
             nearest_degC = min(before_K, key=lambda each_degC: abs(each_degC - chamber_degC))
-            self._tell(gap, nearest_degC, before_K[nearest_degC], chamber_degC, after_K)
+            self._report_change(gap, nearest_degC, before_K[nearest_degC], chamber_degC, after_K)
         self._gap = None
         self._settled_K = {**before_K, chamber_degC: after_K}
 
-    def _offset_K(self) -> float:
-        since_ns = self._clock.now_ns() - seconds_ns(_WINDOW_S)
+    def _compute_offset_K(self) -> float:
+        since_ns = self._clock.now_ns() - to_ns(_WINDOW_S)
         camera, air = (
             [value for time_ns, value in self._readings[name] if time_ns >= since_ns] for name in (CAMERA, AIR)
         )
         return float(np.mean(camera) - np.mean(air)) if _is_steady(camera) and air else math.nan
 
-    def _tell(self, gap: OffsetGap, before_degC: float, before_K: float, after_degC: float, after_K: float) -> None:
+    def _report_change(
+        self, gap: OffsetGap, before_degC: float, before_K: float, after_degC: float, after_K: float
+    ) -> None:
         kind = CAMERA_OFFSET_CHANGED if abs(after_K - before_K) > LIMIT_K else CAMERA_OFFSET_SAME
         event = kind.at(
             self._clock.now_ns(),
@@ -106,11 +108,11 @@ class OffsetWatch:
                 kept = self._readings.get(reading.channel)
                 if kept is not None and math.isfinite(reading.value):
                     kept.append((reading.time_ns, reading.value))
-                    while kept[0][0] < reading.time_ns - seconds_ns(_WINDOW_S):
+                    while kept[0][0] < reading.time_ns - to_ns(_WINDOW_S):
                         kept.popleft()
 
 
-def settled_offsets(session: Session) -> dict[float, float]:
+def compute_settled_offsets(session: Session) -> dict[float, float]:
     """Camera minus air (K) by set-point (degC), as it was last when a capture began there with a settled camera."""
     found: dict[float, float] = {}
     readings = [session.readings(channel) for channel in (CAMERA, AIR)]
@@ -137,7 +139,7 @@ _SAME_K = 1.0  # a camera that is as warm as it was last has been on
 
 
 @dataclass(frozen=True, slots=True)
-class CameraBefore:
+class CameraHistory:
     """What a session records of the camera. last: its last temperature, None when it never gave one. boot_id: of the
     host, "" when it is not known. lost: why it was not in equilibrium at the end, "" when it was.
     offsets_K: camera minus air by set-point (degC)."""
@@ -148,7 +150,9 @@ class CameraBefore:
     offsets_K: Mapping[float, float] = field(default_factory=dict[float, float])
 
 
-def doubt(before: CameraBefore, boot_id: str | None, was_supplied: bool | None, reading: Reading | None) -> str:
+def explain_possible_power_loss(
+    before: CameraHistory, boot_id: str | None, was_supplied: bool | None, reading: Reading | None
+) -> str:
     """Why the camera may have been off since, "" when it was not.
 
     boot_id: of the host now, None in virtual time. was_supplied: whether its supply read on before it was switched on,
@@ -165,7 +169,7 @@ def doubt(before: CameraBefore, boot_id: str | None, was_supplied: bool | None, 
     return before.lost
 
 
-def camera_before(session: Session) -> CameraBefore:
+def load_camera_history(session: Session) -> CameraHistory:
     """By what is recorded."""
     boot_id = lost = ""
     events = [
@@ -182,11 +186,11 @@ def camera_before(session: Session) -> CameraBefore:
     if any(mark.kind == "power_camera" and mark.time_ns > lost_ns for mark in session.steps()):
         lost = ""  # by the plan, which soaks it as it needs it
     if CAMERA not in session.channels():  # a stand without a camera, or one that has reported nothing yet
-        return CameraBefore(None, boot_id, lost)
-    return CameraBefore(_last_word(session), boot_id, lost, settled_offsets(session))
+        return CameraHistory(None, boot_id, lost)
+    return CameraHistory(_find_last_temperature(session), boot_id, lost, compute_settled_offsets(session))
 
 
-def _last_word(session: Session) -> CameraTemperature | None:
+def _find_last_temperature(session: Session) -> CameraTemperature | None:
     """The camera's last temperature; None when it never gave one."""
     times_ns, values_degC = session.readings(CAMERA)
     for time_ns, camera_degC in zip(reversed(times_ns.tolist()), reversed(values_degC.tolist()), strict=True):

@@ -12,7 +12,7 @@ import math
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
 from contextlib import contextmanager
 
-from thermostand.experiments.known import Undecided
+from thermostand.experiments.adaptive import Undecided
 from thermostand.experiments.steps import (
     Capture,
     Decide,
@@ -33,36 +33,36 @@ from thermostand.foundation.events import (
 )
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepMark, StepState
-from thermostand.foundation.tasks import cancelled, first_of
-from thermostand.recording.format.restarts import restarted
+from thermostand.foundation.tasks import cancel_all, wait_for_first
+from thermostand.recording.format.capture_restarts import make_restart_event
 from thermostand.stand.interlock import Interlocked
 from thermostand.stand.running.executing.actions import (
     Action,
-    Aim,
+    ArmCapture,
     Begin,
     Complete,
-    Earn,
+    ContinueSoak,
     Equilibrate,
-    OpenAgain,
     Perform,
-    Readies,
+    PreparingAction,
+    ReopenFlap,
+    RestartCold,
     Restore,
+    Retake,
     Sleep,
-    StartCold,
     Surroundings,
-    TakeAgain,
     TakeFrame,
     Wait,
-    due_after_ns,
-    is_lossy,
-    next_action,
-    next_due_ns,
-    worth_of_soaks,
+    choose_next_action,
+    compute_due_after_ns,
+    compute_next_due_ns,
+    credit_soaks,
+    needs_retake,
 )
 from thermostand.stand.running.executing.camera_gap import OffsetWatch
-from thermostand.stand.running.executing.deciding import Decided, change_of_plan, fixed_plan
+from thermostand.stand.running.executing.decisions import Decision, keep_fixed_plan, make_plan_change
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
-from thermostand.stand.running.executing.soaking import Soaking
+from thermostand.stand.running.executing.soaking import SoakRunner
 from thermostand.stand.running.memory.entries import (
     Again,
     Change,
@@ -75,10 +75,10 @@ from thermostand.stand.running.memory.entries import (
     Soaked,
     StepChanged,
     Taken,
-    data_of,
-    edited,
+    make_change_data,
+    make_edit,
 )
-from thermostand.stand.running.memory.fold import after, change_text, refusal
+from thermostand.stand.running.memory.fold import apply_entry, describe_change, find_refusal
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.memory.state import Plan, RunState, SetUp
 from thermostand.stand.stand import Stand
@@ -86,36 +86,36 @@ from thermostand.stand.stand import Stand
 # Brings about again what the steps so far have set up, after something has undone it.
 
 
-async def restore(
+async def restore_set_up(
     stand: Stand, log: Logbook, clock: Clock, set_up: SetUp, surroundings: Callable[[], Surroundings]
 ) -> None:
     """The last set-up of each kind again, but for the flap; it stays closed until the chamber is at its place."""
-    disturbances = log.state.disturbances
+    disturbances = log.state.setup_invalidations
     await stand.imaging.close_flap()
     for planned in set_up.others.values():
-        await stand.gate.passed()
+        await stand.gate.wait_until_open()
         await planned.step.perform(stand)
     for axis, position in set_up.positions.items():
-        await stand.gate.passed()
+        await stand.gate.wait_until_open()
         await stand.table.move_to(axis, position)
-    await stand.gate.passed()
+    await stand.gate.wait_until_open()
     if set_up.camera_on:
         await stand.imaging.supply.restore()
     else:
         await stand.imaging.power_camera(on=False)
     if set_up.chamber_degC is not None:
-        await stand.gate.passed()
-        worth, now_ns = worth_of_soaks(log.state, set_up, surroundings()), clock.now_ns()
-        if worth.lost:
-            await log.write(*(Soaked(now_ns, soak.step_id, 0.0) for soak in worth.lost))
-        if worth.text:
-            log.tell(SOAK_RESTARTED if worth.lost else SOAK_CREDITED, worth.text)
+        await stand.gate.wait_until_open()
+        credit, now_ns = credit_soaks(log.state, set_up, surroundings()), clock.now_ns()
+        if credit.lost:
+            await log.write(*(Soaked(now_ns, soak.step_id, 0.0) for soak in credit.lost))
+        if credit.text:
+            log.tell(SOAK_RESTARTED if credit.lost else SOAK_CREDITED, credit.text)
         await stand.chamber.start(set_up.chamber_degC)
     log.enter(Restored(clock.now_ns(), disturbances))
     log.tell(RESTORED, set_up.text)
 
 
-def unguarded(error: DeviceError) -> None:
+def raise_unguarded(error: DeviceError) -> None:
     """Where no guard holds a run, a device error ends it."""
     raise error
 
@@ -141,15 +141,15 @@ class Executor:
         offsets: OffsetWatch,
         allowed: Callable[[Plan], object] = len,
         lost: Callable[[str], int] = lambda _: 0,
-        decider: Callable[[Decide], Awaitable[Decided]] = fixed_plan,
-        meet: Callable[[DeviceError], None] = unguarded,
+        decider: Callable[[Decide], Awaitable[Decision]] = keep_fixed_plan,
+        meet: Callable[[DeviceError], None] = raise_unguarded,
     ) -> None:
         self._stand = stand
         self._hub = hub
         self._clock = clock
         self._log = log
         self._flushed = flushed
-        self._soaking = Soaking(stand.gate, clock, log, settling)
+        self._soaking = SoakRunner(stand.gate, clock, log, settling)
         self._offsets = offsets
         self._allowed = allowed
         self._lost = lost
@@ -166,9 +166,9 @@ class Executor:
 
     async def run(self) -> None:
         """What is not done of the plan."""
-        while (action := next_action(self._state, self._surroundings())) is not None:
-            with self._failing():
-                is_done = await self._tried(action)
+        while (action := choose_next_action(self._state, self._surroundings())) is not None:
+            with self._mark_failure():
+                is_done = await self._try(action)
             if is_done:
                 await self._conclude(action)
 
@@ -183,22 +183,24 @@ class Executor:
 
     async def edit(self, from_index: int, steps: Sequence[Step]) -> None:
         """Replace the steps from the place `from_index` on, none of which was begun; else as `skip`."""
-        await self._change(edited(self._clock.now_ns(), from_index, steps))
+        await self._change(make_edit(self._clock.now_ns(), from_index, steps))
 
     async def _change(self, change: Change) -> None:
         """Published before it is journaled, as everything that the recording needs."""
-        if reason := refusal(self._state, change):
+        if reason := find_refusal(self._state, change):
             raise ConfigError(reason)
-        changed = after(self._state, change)
+        changed = apply_entry(self._state, change)
         self._allowed(changed.plan)
         if isinstance(change, Skipped) and (planned := self._state.step(change.step_id)):
             self._mark(planned, StepState.SKIPPED)
-        self._log.tell(PLAN_CHANGED, change_text(self._state, change), **{**data_of(change), **changed.size})
+        self._log.tell(
+            PLAN_CHANGED, describe_change(self._state, change), **{**make_change_data(change), **changed.size}
+        )
         self._changed.set()
         self._changed = asyncio.Event()
         await self._log.write(change)
 
-    def _changes(self) -> asyncio.Event:
+    def _get_change_event(self) -> asyncio.Event:
         """Set when the plan is changed the next time."""
         return self._changed
 
@@ -219,7 +221,7 @@ class Executor:
         )
 
     @contextmanager
-    def _failing(self) -> Generator[None]:
+    def _mark_failure(self) -> Generator[None]:
         """What ends the run inside is the failure of the step under way."""
         try:
             yield
@@ -228,18 +230,18 @@ class Executor:
                 self._mark(planned, StepState.FAILED)
             raise
 
-    async def _tried(self, action: Action) -> bool:
+    async def _try(self, action: Action) -> bool:
         """Whether the action came to its end; not so when something has undone the set-up meanwhile."""
         state = self._state
-        is_readying = isinstance(action, Readies) or (
-            isinstance(action, Earn) and action.soak.step_id != state.plan[state.index].step_id
+        is_readying = isinstance(action, PreparingAction) or (
+            isinstance(action, ContinueSoak) and action.soak.step_id != state.plan[state.index].step_id
         )
         if is_readying != state.readying and not isinstance(action, Sleep):
             self._log.enter(Readying(self._clock.now_ns(), is_readying))
         try:
             await self._act(action)
         except (DeviceError, Interlocked) as error:
-            if self._state.disturbances == state.disturbances:
+            if self._state.setup_invalidations == state.setup_invalidations:
                 if isinstance(error, Interlocked | Superseded):  # a stop, or somebody's newer order: no fault
                     raise
                 self._meet(error)
@@ -256,66 +258,66 @@ class Executor:
         stand = self._stand
         match action:
             case Sleep(until_ns):
-                await first_of(self._clock.sleep_until(until_ns), self._changed.wait())
+                await wait_for_first(self._clock.sleep_until(until_ns), self._changed.wait())
             case Wait():
-                await stand.gate.passed()
+                await stand.gate.wait_until_open()
             case Restore(set_up):
-                await restore(stand, self._log, self._clock, set_up, self._surroundings)
-            case Earn(soak):
-                await self._soaking.earn(soak.step_id, self._changes)
+                await restore_set_up(stand, self._log, self._clock, set_up, self._surroundings)
+            case ContinueSoak(soak):
+                await self._soaking.soak(soak.step_id, self._get_change_event)
             case Equilibrate():
                 changes = self._state.changes
-                await stand.imaging.supply.equilibrium.regained(
-                    lambda: self._state.is_disturbed or self._state.changes != changes
+                await stand.imaging.supply.equilibrium.wait_until_regained(
+                    lambda: self._state.is_setup_invalid or self._state.changes != changes
                 )
-            case OpenAgain():
+            case ReopenFlap():
                 await stand.imaging.open_flap()
             case Begin(planned):
                 await self._log.write(StepChanged(self._clock.now_ns(), planned.step_id, "started"))
                 self._mark(planned, StepState.STARTED)
-            case Aim(capture):
-                await self._aim(capture)
-            case TakeAgain(planned, why, frames_lost):
-                await self._begin_again((planned,), why, frames_lost)
+            case ArmCapture(capture):
+                await self._arm_capture(capture)
+            case Retake(planned, why, frames_lost):
+                await self._restart_steps((planned,), why, frames_lost)
             case TakeFrame():
-                await self._take(action)
+                await self._take_frame(action)
             case Perform(planned):
                 await self._perform(planned)
             case Complete(planned):
                 if isinstance(planned.step, Capture):
                     await self._flushed()
-            case StartCold():
+            case RestartCold():
                 pass  # what is under way has failed
 
     async def _conclude(self, action: Action) -> None:
         """What follows when the step under way is done, or has to wait for those before it."""
         match action:
-            case Complete(planned) if is_lossy(self._state, self._surroundings(), planned):
+            case Complete(planned) if needs_retake(self._state, self._surroundings(), planned):
                 pass  # by the flush: it is taken again
             case Complete(planned) | Perform(planned) if planned.step_id == self._state.under_way:
                 self._mark(planned, StepState.DONE)
                 await self._flushed()
                 await self._log.write(StepChanged(self._clock.now_ns(), planned.step_id, "done"))
-            case StartCold(again):
+            case RestartCold(again):
                 if planned := self._state.step(self._state.under_way):
                     self._mark(planned, StepState.FAILED)
-                await self._begin_again(again, "from a cold camera")
+                await self._restart_steps(again, "from a cold camera")
             case _:
                 pass
 
-    async def _begin_again(self, again: Plan, how: str, frames_lost: int = 0) -> None:
+    async def _restart_steps(self, again: Plan, how: str, frames_lost: int = 0) -> None:
         """These steps count as neither begun nor done, and no frame of theirs so far: reported before it is journaled,
         so that no frame is ever left out unreported."""
         now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
         frames = self._state.frames.get(step_ids[-1], 0)
-        self._hub.publish(restarted(now_ns, step_ids[-1], frames, how, frames_lost))
+        self._hub.publish(make_restart_event(now_ns, step_ids[-1], frames, how, frames_lost))
         await self._flushed()
         await self._log.write(Again(now_ns, step_ids, frames_lost))
 
     async def _perform(self, planned: PlannedStep) -> None:
         step = planned.step
         work = self._decide(planned, step) if isinstance(step, Decide) else step.perform(self._stand)
-        await (self._unless_skipped(planned.step_id, work) if step.ends_when_skipped else work)
+        await (self._run_unless_skipped(planned.step_id, work) if step.ends_when_skipped else work)
 
     async def _decide(self, planned: PlannedStep, step: Decide) -> None:
         """Not again after a kill between the decision and the end of the step."""
@@ -324,22 +326,22 @@ class Executor:
         decided = await self._decider(step)
         if isinstance(decided.answer, Undecided):
             self._log.tell(UNDECIDED, f"{decided.reason}; the fixed plan goes on")
-        change = change_of_plan(self._state, planned, decided, self._clock.now_ns())
+        change = make_plan_change(self._state, planned, decided, self._clock.now_ns())
         if change is None:
             self._log.tell(UNDECIDED, "an operator has changed the plan; nothing more is decided about it")
         else:
             await self._change(change)
 
-    async def _aim(self, capture: Capture) -> None:
+    async def _arm_capture(self, capture: Capture) -> None:
         await self._stand.table.approach_again()
         state = self._state
-        due_ns = next_due_ns(state.due_ns, capture, self._surroundings(), is_lost=state.is_lost)
+        due_ns = compute_next_due_ns(state.due_ns, capture, self._surroundings(), is_lost=state.is_lost)
         self._log.enter(Due(self._clock.now_ns(), due_ns))
 
-    async def _take(self, frame: TakeFrame) -> None:
+    async def _take_frame(self, frame: TakeFrame) -> None:
         capture, step_id = frame.capture, frame.planned.step_id
         if frame.is_settled:
-            self._offsets.settled(capture.chamber_degC)
+            self._offsets.note_settled(capture.chamber_degC)
         if self._state.was_held and capture.role is Role.WARM_UP:
             # A camera continues to warm up while the run is held: what was not seen of it is reported.
             missing_s = (self._clock.now_ns() - self._state.seen_ns) / NS_PER_S
@@ -350,9 +352,9 @@ class Executor:
         now_ns = self._clock.now_ns()
         if is_taken:
             self._log.enter(Taken(now_ns, step_id))
-        self._log.enter(Due(now_ns, due_after_ns(frame.due_ns, capture, now_ns), lost=not is_taken))
+        self._log.enter(Due(now_ns, compute_due_after_ns(frame.due_ns, capture, now_ns), lost=not is_taken))
 
-    async def _unless_skipped(self, step_id: str, work: Coroutine[None, None, None]) -> None:
+    async def _run_unless_skipped(self, step_id: str, work: Coroutine[None, None, None]) -> None:
         """The work of a step, broken off when that is left out."""
         task = asyncio.create_task(work)
         try:
@@ -363,7 +365,7 @@ class Executor:
             if task.done():
                 task.result()
         finally:
-            await cancelled([task])
+            await cancel_all([task])
 
     def _on_lost_equilibrium(self) -> None:
         """The camera has to be brought back as well; in a plan that has it off that is nothing."""

@@ -1,5 +1,5 @@
 """What happens to a run, entry by entry. RunState is folded from them; those that outlive the daemon are lines of its
-journal (recording/reading/journal_lines.py).
+journal (recording/reading/format_lines.py).
 
     Begun        the run, its plan and the texts it was made of; the first line and no other
     StepChanged  a step was started, or is done
@@ -36,7 +36,7 @@ from typing import Literal, cast
 from pydantic import TypeAdapter, ValidationError
 
 from thermostand.experiments.steps import Step
-from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
 
@@ -187,7 +187,7 @@ class Restored:
     """What the first `disturbances` of the run had undone is as it was."""
 
     time_ns: int
-    disturbances: int
+    setup_invalidations: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,17 +197,17 @@ class Cooled:
     time_ns: int
 
 
-Written = Begun | StepChanged | Soaked | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Reset | Ended
-Entry = Written | Taken | Due | Readying | Restored | Cooled
+JournalEntry = Begun | StepChanged | Soaked | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Reset | Ended
+Entry = JournalEntry | Taken | Due | Readying | Restored | Cooled
 Change = Skipped | Extended | Edited  # of the plan
 
-_WRITTEN: dict[str, type[Written]] = {"Step": StepChanged} | {
+_ENTRY_CLASSES: dict[str, type[JournalEntry]] = {"Step": StepChanged} | {
     kind.__name__: kind for kind in (Begun, Soaked, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Reset, Ended)
 }
-_NAMES = {kind: name for name, kind in _WRITTEN.items()}
+_NAMES = {kind: name for name, kind in _ENTRY_CLASSES.items()}
 
 
-def edited(time_ns: int, from_index: int, steps: Iterable[Step], decided: str = "", reason: str = "") -> Edited:
+def make_edit(time_ns: int, from_index: int, steps: Iterable[Step], decided: str = "", reason: str = "") -> Edited:
     """The steps from a place on replaced by these."""
     by: list[dict[str, object]] = [{"kind": step.kind, "parameters": step.parameters} for step in steps]
     return Edited(time_ns, from_index, by, decided, reason)
@@ -216,14 +216,14 @@ def edited(time_ns: int, from_index: int, steps: Iterable[Step], decided: str = 
 _CHANGES: dict[object, type[Change]] = {kind.__name__: kind for kind in (Skipped, Extended, Edited)}
 
 
-def data_of(change: Change) -> dict[str, object]:
+def make_change_data(change: Change) -> dict[str, object]:
     """The change of a plan as the recording has it, but for its instant and what an operator's change has none of."""
     left_out = {each.name for each in fields(change) if getattr(change, each.name) == each.default} | {"time_ns"}
     return {"change": type(change).__name__, **{name: v for name, v in asdict(change).items() if name not in left_out}}
 
 
-def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
-    """The change that `data_of` has given, among other fields; None when there is none."""
+def parse_change(time_ns: int, data: Mapping[str, object]) -> Change | None:
+    """The change that `make_change_data` has given, among other fields; None when there is none."""
     kind = _CHANGES.get(data.get("change"))
     if kind is None:
         return None
@@ -235,18 +235,18 @@ def change_of(time_ns: int, data: Mapping[str, object]) -> Change | None:
         return None
 
 
-def encoded(entry: Written) -> bytes:
+def encode(entry: JournalEntry) -> bytes:
     """What its line says."""
     return json.dumps({"entry": _NAMES[type(entry)], **asdict(entry)}).encode()
 
 
-def decoded(text: bytes) -> Written:
+def decode(text: bytes) -> JournalEntry:
     """The entry in a sound line; SessionError when it is not known here, or holds values of other types."""
     try:
         values = cast("dict[str, object]", json.loads(text))
         return _adapter(cast("str", values.pop("entry"))).validate_python(values)
     except ValidationError as error:
-        wrong = "; ".join(f"{path_text(fault['loc'])}: {fault['msg']}" for fault in error.errors())
+        wrong = "; ".join(f"{format_path(fault['loc'])}: {fault['msg']}" for fault in error.errors())
         if any(fault["type"] in ("missing", "unexpected_keyword_argument") for fault in error.errors()):
             raise SessionError(f"{JOURNAL_NAME}: an entry is of another version of thermostand ({wrong})") from error
         raise SessionError(f"{JOURNAL_NAME}: no run has written such entries ({wrong}); begin a new run") from error
@@ -255,6 +255,6 @@ def decoded(text: bytes) -> Written:
 
 
 @cache
-def _adapter(name: str) -> TypeAdapter[Written]:
+def _adapter(name: str) -> TypeAdapter[JournalEntry]:
     """Checks the values of the entries of this name; LookupError when there are none."""
-    return TypeAdapter(_WRITTEN[name])
+    return TypeAdapter(_ENTRY_CLASSES[name])

@@ -17,10 +17,10 @@ from thermostand.experiments.steps import (
     AnySoak,
     PlannedStep,
     PowerCamera,
+    make_step,
     number_steps,
-    step_of,
 )
-from thermostand.foundation.clock import seconds_ns
+from thermostand.foundation.clock import to_ns
 from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.running.memory.entries import (
     Again,
@@ -48,41 +48,41 @@ from thermostand.stand.running.memory.state import RunState, SetUp
 def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
     """The state of a run of that plan after these entries. ConfigError when the plan was edited to steps that are not
     known here."""
-    return reduce(after, entries, RunState(tuple(plan)))
+    return reduce(apply_entry, entries, RunState(tuple(plan)))
 
 
-def after(state: RunState, entry: Entry) -> RunState:
+def apply_entry(state: RunState, entry: Entry) -> RunState:
     """What the state is after one more entry. What does not fit, such as a change of a step that is done, changes
     nothing."""
     match entry:
         case StepChanged():
-            return _begun(state, entry) if entry.state == "started" else _done(state, entry)
+            return _apply_begin(state, entry) if entry.state == "started" else _apply_end(state, entry)
         case Soaked(_, step_id, soaked_s, ended):
             if step_id in state.skipped:
                 return state
             soaked = {**_forget_ends(state, {step_id}), **({step_id: ended} if ended else {})}
-            earned_ns = _with(state.earned_ns, step_id, seconds_ns(soaked_s))
-            return replace(state, earned_ns=earned_ns, soaked=MappingProxyType(soaked))
+            soaked_ns = _set_value(state.soaked_ns, step_id, to_ns(soaked_s))
+            return replace(state, soaked_ns=soaked_ns, soaked=MappingProxyType(soaked))
         case Taken():
-            return _taken(state, entry)
+            return _apply_frame(state, entry)
         case Due(_, due_ns, lost):
             return replace(state, due_ns=due_ns, is_lost=lost)
         case Held():
-            return _held(state, entry)
+            return _apply_hold(state, entry)
         case Readying(time_ns, begins):
-            return _counted(state, time_ns, state.reasons, readying=begins)
+            return _count_outage(state, time_ns, state.reasons, readying=begins)
         case Gap():
-            return _gap(state, entry)
+            return _apply_gap(state, entry)
         case Again():
-            return _again(state, entry)
+            return _apply_restart(state, entry)
         case Cooled():
-            return replace(state, disturbances=state.disturbances + 1, is_cold=True)
+            return replace(state, setup_invalidations=state.setup_invalidations + 1, is_cold=True)
         case Restored(_, disturbances):
-            is_cold = state.is_cold and disturbances < state.disturbances
-            restored = min(max(state.restored, disturbances), state.disturbances)
+            is_cold = state.is_cold and disturbances < state.setup_invalidations
+            restored = min(max(state.restored, disturbances), state.setup_invalidations)
             return replace(state, restored=restored, is_cold=is_cold)
         case Skipped() | Extended() | Edited():
-            return state if refusal(state, entry) else _changed(state, entry)
+            return state if find_refusal(state, entry) else _apply_change(state, entry)
         case Tripped(_, _, text):
             return replace(state, tripped=state.tripped or text)
         case Reset():
@@ -93,12 +93,12 @@ def after(state: RunState, entry: Entry) -> RunState:
             return state
 
 
-def refusal(state: RunState, change: Change) -> str:
+def find_refusal(state: RunState, change: Change) -> str:
     """Why the plan cannot be changed so, "" when it can."""
     if state.index >= len(state.plan):
         return "the plan is done"
     if isinstance(change, Edited):
-        first = _first_free(state)
+        first = _find_first_free(state)
         if not first <= change.from_index <= len(state.plan):
             wanted = change.from_index + 1
             return f"the steps from number {first + 1} on can be replaced, not those from number {wanted} on"
@@ -120,7 +120,7 @@ def refusal(state: RunState, change: Change) -> str:
     return ""
 
 
-def change_text(state: RunState, change: Change) -> str:
+def describe_change(state: RunState, change: Change) -> str:
     """The change of a plan, in words."""
     if isinstance(change, Edited):
         if change.decided:
@@ -135,40 +135,40 @@ def change_text(state: RunState, change: Change) -> str:
     return f"{name} is left out, by an operator"
 
 
-def _first_free(state: RunState) -> int:
+def _find_first_free(state: RunState) -> int:
     """The place of the first step that is neither done nor begun, nor before one that is."""
     used = state.done | state.begun
     return max((planned.index + 1 for planned in state.plan if planned.step_id in used), default=0)
 
 
-def _changed(state: RunState, change: Change) -> RunState:
+def _apply_change(state: RunState, change: Change) -> RunState:
     state = replace(state, changes=(*state.changes, change))
     match change:
         case Skipped(_, step_id):
             state = replace(state, skipped=state.skipped.plus(step_id), done=state.done.plus(step_id))
             if state.under_way == step_id:
                 state = replace(state, under_way="", due_ns=None, is_lost=False)
-            return _placed(state)
+            return _advance_index(state)
         case Extended(_, step_id, by_s):
-            plan = tuple(_longer(each, step_id, by_s) for each in state.plan)
+            plan = tuple(_extend(each, step_id, by_s) for each in state.plan)
             return replace(state, plan=plan, soaked=_forget_ends(state, {step_id}))
         case Edited(_, first, by):
-            made = (step_of(str(each.get("kind")), _mapping(each.get("parameters"))) for each in by)
-            return _placed(replace(state, plan=(*state.plan[:first], *number_steps(made, first))))
+            made = (make_step(str(each.get("kind")), _make_mapping(each.get("parameters"))) for each in by)
+            return _advance_index(replace(state, plan=(*state.plan[:first], *number_steps(made, first))))
 
 
-def _mapping(value: object) -> Mapping[str, object]:
+def _make_mapping(value: object) -> Mapping[str, object]:
     return {str(name): each for name, each in value.items()} if isinstance(value, dict) else {}
 
 
-def _longer(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
+def _extend(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
     step = planned.step
     if planned.step_id != step_id or not isinstance(step, AnySoak):
         return planned
-    return replace(planned, step=step.longer(by_s))
+    return replace(planned, step=step.extend(by_s))
 
 
-def _placed(state: RunState) -> RunState:
+def _advance_index(state: RunState) -> RunState:
     """From its place on: the first step to do, and what those before it have set up."""
     index, set_up = state.index, state.set_up
     while index < len(state.plan) and (planned := state.plan[index]).step_id in state.done:
@@ -177,7 +177,7 @@ def _placed(state: RunState) -> RunState:
     return replace(state, index=index, set_up=set_up)
 
 
-def _begun(state: RunState, entry: StepChanged) -> RunState:
+def _apply_begin(state: RunState, entry: StepChanged) -> RunState:
     """A camera that the plan switches is seen from then on: what follows in the plan is made for that."""
     is_first = state.under_way != entry.step_id
     state = replace(
@@ -190,44 +190,46 @@ def _begun(state: RunState, entry: StepChanged) -> RunState:
     planned = state.step(entry.step_id)
     if planned is None or not isinstance(planned.step, PowerCamera):
         return state
-    return replace(_seen(state, entry.time_ns), was_held=False, is_cold=False)
+    return replace(_mark_camera_seen(state, entry.time_ns), was_held=False, is_cold=False)
 
 
-def _done(state: RunState, entry: StepChanged) -> RunState:
+def _apply_end(state: RunState, entry: StepChanged) -> RunState:
     is_under_way = state.under_way == entry.step_id
-    return _placed(
+    return _advance_index(
         replace(
             state,
             done=state.done.plus(entry.step_id),
             under_way="" if is_under_way else state.under_way,
-            earned_ns=_without(state.earned_ns, entry.step_id),
-            frames=_without(state.frames, entry.step_id),
-            taken_again=_without(state.taken_again, entry.step_id),
+            soaked_ns=_remove_value(state.soaked_ns, entry.step_id),
+            frames=_remove_value(state.frames, entry.step_id),
+            retakes=_remove_value(state.retakes, entry.step_id),
             due_ns=None if is_under_way else state.due_ns,
             is_lost=state.is_lost and not is_under_way,
         )
     )
 
 
-def _taken(state: RunState, entry: Taken) -> RunState:
+def _apply_frame(state: RunState, entry: Taken) -> RunState:
     if entry.step_id in state.done:
         return state
-    frames = _with(state.frames, entry.step_id, state.frames.get(entry.step_id, 0) + 1)
-    return replace(_seen(state, entry.time_ns), frames=frames, was_held=bool(state.reasons))
+    frames = _set_value(state.frames, entry.step_id, state.frames.get(entry.step_id, 0) + 1)
+    return replace(_mark_camera_seen(state, entry.time_ns), frames=frames, was_held=bool(state.reasons))
 
 
-def _seen(state: RunState, time_ns: int) -> RunState:
+def _mark_camera_seen(state: RunState, time_ns: int) -> RunState:
     return replace(state, seen_ns=time_ns, out_ns=0, out_since_ns=None if state.out_since_ns is None else time_ns)
 
 
-def _held(state: RunState, entry: Held) -> RunState:
+def _apply_hold(state: RunState, entry: Held) -> RunState:
     reasons = state.reasons | {entry.reason} if entry.held else state.reasons - {entry.reason}
     undone = entry.held and entry.reason == INTERLOCK  # an interlock makes the stand safe: nothing is as it was
-    state = replace(state, was_held=state.was_held or entry.held, disturbances=state.disturbances + undone)
-    return _counted(state, entry.time_ns, reasons, readying=state.readying)
+    state = replace(
+        state, was_held=state.was_held or entry.held, setup_invalidations=state.setup_invalidations + undone
+    )
+    return _count_outage(state, entry.time_ns, reasons, readying=state.readying)
 
 
-def _counted(state: RunState, time_ns: int, reasons: frozenset[str], *, readying: bool) -> RunState:
+def _count_outage(state: RunState, time_ns: int, reasons: frozenset[str], *, readying: bool) -> RunState:
     """The time during which the run is held or made ready counts; when it is both, once."""
     return replace(
         state,
@@ -238,12 +240,12 @@ def _counted(state: RunState, time_ns: int, reasons: frozenset[str], *, readying
     )
 
 
-def _gap(state: RunState, entry: Gap) -> RunState:
+def _apply_gap(state: RunState, entry: Gap) -> RunState:
     """Another daemon resumes the run: nothing holds it yet, nothing is under way, and the stand's state is unknown."""
     return replace(
         state,
         under_way="",
-        disturbances=state.disturbances + 1,
+        setup_invalidations=state.setup_invalidations + 1,
         reasons=frozenset[str](),
         readying=False,
         out_ns=state.outage_ns(entry.from_ns) + entry.time_ns - entry.from_ns,
@@ -254,9 +256,9 @@ def _gap(state: RunState, entry: Gap) -> RunState:
     )
 
 
-def _again(state: RunState, entry: Again) -> RunState:
+def _apply_restart(state: RunState, entry: Again) -> RunState:
     """A capture under way is restarted where it is; for other steps what those before them set up is needed again."""
-    ids, counts = frozenset(entry.step_ids), state.taken_again
+    ids, counts = frozenset(entry.step_ids), state.retakes
     lossy = {each: counts.get(each, 0) + 1 for each in entry.step_ids} if entry.frames_lost else {}
     frames = MappingProxyType({each: count for each, count in state.frames.items() if each not in ids})
     kept = replace(
@@ -268,11 +270,13 @@ def _again(state: RunState, entry: Again) -> RunState:
         skipped=state.skipped.minus(ids),
         frames=frames,
         soaked=_forget_ends(state, ids),
-        taken_again=MappingProxyType({**counts, **lossy}) if lossy else counts,
+        retakes=MappingProxyType({**counts, **lossy}) if lossy else counts,
     )
     if ids != frozenset((state.under_way,)):
-        kept = replace(kept, under_way="", due_ns=None, is_lost=False, disturbances=state.disturbances + 1)
-    return _placed(kept)
+        kept = replace(
+            kept, under_way="", due_ns=None, is_lost=False, setup_invalidations=state.setup_invalidations + 1
+        )
+    return _advance_index(kept)
 
 
 def _forget_ends(state: RunState, step_ids: Collection[str]) -> Mapping[str, str]:
@@ -280,11 +284,11 @@ def _forget_ends(state: RunState, step_ids: Collection[str]) -> Mapping[str, str
     return MappingProxyType({each: ended for each, ended in state.soaked.items() if each not in step_ids})
 
 
-def _with(values: Mapping[str, int], name: str, value: int) -> Mapping[str, int]:
+def _set_value(values: Mapping[str, int], name: str, value: int) -> Mapping[str, int]:
     return MappingProxyType({**values, name: value})
 
 
-def _without(values: Mapping[str, int], name: str) -> Mapping[str, int]:
+def _remove_value(values: Mapping[str, int], name: str) -> Mapping[str, int]:
     return (
         MappingProxyType({each: value for each, value in values.items() if each != name}) if name in values else values
     )

@@ -25,7 +25,7 @@ from thermostand.experiments.steps import (
     StartChamber,
     StopChamber,
 )
-from thermostand.foundation.clock import NS_PER_S, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.stand.running.memory.entries import Change, Edited, Ended
 
 # Ids of steps, as an immutable set to which one is added quickly: a plan may have 100,000 steps.
@@ -72,7 +72,7 @@ class Ids(Set[str]):
 Plan = tuple[PlannedStep, ...]
 
 
-def _nothing() -> Mapping[str, int]:
+def _make_empty() -> Mapping[str, int]:
     return MappingProxyType({})
 
 
@@ -153,12 +153,12 @@ class RunState:
     begun: Ids = field(default_factory=Ids)
     skipped: Ids = field(default_factory=Ids)
     under_way: str = ""
-    earned_ns: Mapping[str, int] = field(default_factory=_nothing)
+    soaked_ns: Mapping[str, int] = field(default_factory=_make_empty)
     soaked: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    frames: Mapping[str, int] = field(default_factory=_nothing)
-    taken_again: Mapping[str, int] = field(default_factory=_nothing)
+    frames: Mapping[str, int] = field(default_factory=_make_empty)
+    retakes: Mapping[str, int] = field(default_factory=_make_empty)
     changes: tuple[Change, ...] = ()
-    disturbances: int = 0
+    setup_invalidations: int = 0
     restored: int = 0
     is_cold: bool = False
     reasons: frozenset[str] = frozenset()
@@ -177,14 +177,14 @@ class RunState:
         return any(isinstance(change, Edited) and change.decided == step_id for change in self.changes)
 
     @property
-    def is_disturbed(self) -> bool:
+    def is_setup_invalid(self) -> bool:
         """Whether the set-up has to be brought about again."""
-        return self.disturbances > self.restored
+        return self.setup_invalidations > self.restored
 
     @property
     def soaked_s(self) -> dict[str, float]:
         """As earned_ns, in s."""
-        return {step_id: earned_ns / NS_PER_S for step_id, earned_ns in self.earned_ns.items()}
+        return {step_id: earned_ns / NS_PER_S for step_id, earned_ns in self.soaked_ns.items()}
 
     @property
     def size(self) -> dict[str, object]:
@@ -203,16 +203,16 @@ class RunState:
     def is_unsettled(self) -> bool:
         """Whether the last guaranteed soak at the present set-point ended without the chamber in its band, or all of
         them were left out."""
-        soaks = list(self._soaks_here())
+        soaks = list(self._iterate_soaks())
         done = (each.step_id for each, _ in soaks if each.step_id not in self.skipped)
         return bool(soaks) and self.soaked.get(next(done, ""), "unsettled") == "unsettled"
 
     @property
     def band_K(self) -> float | None:
         """Of the last guaranteed soak at the present set-point that was not left out; None when there is none."""
-        return next((band_K for each, band_K in self._soaks_here() if each.step_id not in self.skipped), None)
+        return next((band_K for each, band_K in self._iterate_soaks() if each.step_id not in self.skipped), None)
 
-    def _soaks_here(self) -> Iterator[tuple[PlannedStep, float]]:
+    def _iterate_soaks(self) -> Iterator[tuple[PlannedStep, float]]:
         """The guaranteed soaks at the present set-point with their bands, K; the last one first."""
         for planned in reversed(self.plan[: self.index]):
             if isinstance(planned.step, AnySoak) and planned.step.guaranteed_K > 0.0:
@@ -228,19 +228,19 @@ class RunState:
             return self.plan[self.index]
         return next((planned for planned in self.plan if planned.step_id == step_id), None)
 
-    def owed_ns(self, soak: PlannedStep) -> int:
+    def remaining_ns(self, soak: PlannedStep) -> int:
         """What the soak has not earned yet of its longest time; nothing when it has ended, or is left out."""
         if soak.step_id in self.soaked or soak.step_id in self.skipped:
             return 0
-        duration_ns = duration_of(soak)
-        earned_ns = self.earned_ns.get(soak.step_id, duration_ns if soak.step_id in self.done else 0)
-        return max(0, duration_ns - earned_ns)
+        duration_ns = get_duration_ns(soak)
+        soaked_ns = self.soaked_ns.get(soak.step_id, duration_ns if soak.step_id in self.done else 0)
+        return max(0, duration_ns - soaked_ns)
 
     def outage_ns(self, now_ns: int) -> int:
         """For how long the run stood still since the camera was last seen."""
         return self.out_ns + (0 if self.out_since_ns is None else now_ns - self.out_since_ns)
 
 
-def duration_of(soak: PlannedStep) -> int:
+def get_duration_ns(soak: PlannedStep) -> int:
     """What the soak takes at the most, ns; 0 when it is no soak."""
-    return seconds_ns(soak.step.longest_s) if isinstance(soak.step, AnySoak) else 0
+    return to_ns(soak.step.longest_s) if isinstance(soak.step, AnySoak) else 0

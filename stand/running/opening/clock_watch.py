@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from thermostand.foundation.clock import NS_PER_S, PIECE_S, WallClock, seconds_ns
+from thermostand.foundation.clock import NS_PER_S, PIECE_S, WallClock, to_ns
 from thermostand.foundation.events import HOST_SUSPENDED
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.instants import duration
-from thermostand.recording.format.utc_offsets import REPEATED_NS, offset_event, step_event
+from thermostand.foundation.instants import format_duration
+from thermostand.recording.format.utc_offsets import REPEATED_NS, make_offset_event, make_step_event
 
 _PERIOD_S = PIECE_S
-_LIMIT_NS = seconds_ns(1.0)  # time servers correct by less; round number, nothing was measured
+_LIMIT_NS = to_ns(1.0)  # time servers correct by less; round number, nothing was measured
 
 
 class ClockWatch:
@@ -31,7 +31,7 @@ class ClockWatch:
         """Look until cancelled."""
         while True:
             self.look()
-            await self._clock.sleep_until(self._clock.now_ns() + seconds_ns(_PERIOD_S))
+            await self._clock.sleep_until(self._clock.now_ns() + to_ns(_PERIOD_S))
 
     def look(self) -> None:
         """Once, now."""
@@ -41,20 +41,20 @@ class ClockWatch:
             self._clock.suspended_ns(),
         )
         if suspended_ns - self._suspended_ns > _LIMIT_NS:
-            self._tell_suspend(now_ns, suspended_ns - self._suspended_ns)
+            self._report_suspend(now_ns, suspended_ns - self._suspended_ns)
             self._suspended_ns = suspended_ns
         if abs(offset_ns - self._recorded_ns) > _LIMIT_NS:
-            self._tell_step(now_ns, offset_ns)
+            self._report_step(now_ns, offset_ns)
         elif self._recorded_ns and now_ns - self._reported_ns >= REPEATED_NS:
             self._reported_ns = now_ns
-            self._hub.publish(offset_event(now_ns, self._recorded_ns))
+            self._hub.publish(make_offset_event(now_ns, self._recorded_ns))
         self._seen_ns = now_ns
 
-    def _tell_suspend(self, now_ns: int, length_ns: int) -> None:
+    def _report_suspend(self, now_ns: int, length_ns: int) -> None:
         data = {"length_s": length_ns / NS_PER_S, "seen_ns": self._seen_ns, "stand_ns": now_ns}
-        self._hub.publish(HOST_SUSPENDED.at(now_ns, duration(length_ns), **data))
+        self._hub.publish(HOST_SUSPENDED.at(now_ns, format_duration(length_ns), **data))
 
-    def _tell_step(self, now_ns: int, offset_ns: int) -> None:
-        stepped = step_event(now_ns, self._recorded_ns, offset_ns, self._seen_ns)
+    def _report_step(self, now_ns: int, offset_ns: int) -> None:
+        stepped = make_step_event(now_ns, self._recorded_ns, offset_ns, self._seen_ns)
         self._recorded_ns, self._reported_ns = offset_ns, now_ns
         self._hub.publish(stepped)

@@ -6,12 +6,12 @@ cold, and no equilibrium). And in virtual time, where no operator is there, a ho
 
 from __future__ import annotations
 
-from thermostand.foundation.clock import Clock, seconds_ns
+from thermostand.foundation.clock import Clock, to_ns
 from thermostand.foundation.errors import DeviceError, NotReset, StandError
 from thermostand.foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_HOLD
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
-from thermostand.foundation.tasks import first_of
+from thermostand.foundation.tasks import wait_for_first
 from thermostand.stand.gate import STOPPING, Gate
 from thermostand.stand.latch import Latch
 from thermostand.stand.stand import Stand
@@ -27,17 +27,21 @@ _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be wo
 async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
     """Until cancelled. Events: `flap_shut_in_hold` and, when it does not close, `flap_not_shut` (an error)."""
     while True:
-        await stand.gate.closed()
+        await stand.gate.wait_until_closed()
         if await _opens_within(stand.gate, clock, SHUT_AFTER_S):
             continue
         while stand.gate.reasons:
             wait_s = _LOOK_S
-            if stand.imaging.flap_open and STOPPING not in stand.gate.reasons and not await _shut(stand, hub, clock):
+            if (
+                stand.imaging.flap_open
+                and STOPPING not in stand.gate.reasons
+                and not await _shut_flap(stand, hub, clock)
+            ):
                 wait_s = _AGAIN_S
             await _opens_within(stand.gate, clock, wait_s)
 
 
-async def _shut(stand: Stand, hub: Hub, clock: Clock) -> bool:
+async def _shut_flap(stand: Stand, hub: Hub, clock: Clock) -> bool:
     """Whether it is shut now."""
     reasons = sorted(stand.gate.reasons)
     try:
@@ -51,7 +55,7 @@ async def _shut(stand: Stand, hub: Hub, clock: Clock) -> bool:
 
 async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
     """Whether the gate opens before so long is over."""
-    return await first_of(gate.passed(), clock.sleep_until(clock.now_ns() + seconds_ns(duration_s))) == 0
+    return await wait_for_first(gate.wait_until_open(), clock.sleep_until(clock.now_ns() + to_ns(duration_s))) == 0
 
 
 async def end_endless_holds(gate: Gate, hub: Hub, clock: Clock, latch: Latch, limit_h: float) -> None:
@@ -73,17 +77,17 @@ async def end_endless_holds(gate: Gate, hub: Hub, clock: Clock, latch: Latch, li
     hub.subscribe(receive)
     try:
         while True:
-            await gate.closed()
+            await gate.wait_until_closed()
             now_ns, fault = clock.now_ns(), latch.fault
             since_ns = now_ns if since_ns is None else since_ns
             if fault is None or fault.ends_itself:
                 waits_ns = None
             elif waits_ns is None:
                 waits_ns = now_ns
-            elif now_ns - waits_ns >= seconds_ns(_CLEARED_WITHIN_S):
+            elif now_ns - waits_ns >= to_ns(_CLEARED_WITHIN_S):
                 minutes = _CLEARED_WITHIN_S / 60
                 raise NotReset(f"held for {minutes:g} min of virtual time, and nobody reset it: {fault.text}")
-            if now_ns - since_ns >= seconds_ns(3600.0 * limit_h):
+            if now_ns - since_ns >= to_ns(3600.0 * limit_h):
                 reasons = fault.text if fault else ", ".join(sorted(gate.reasons))
                 raise StandError(f"held for {limit_h:g} h of virtual time ({reasons}), and nobody continued it")
             await _opens_within(gate, clock, _ENDLESS_LOOK_S)

@@ -15,9 +15,9 @@ from thermostand.drivers.devices.protocols import Actuator
 from thermostand.foundation.clock import VirtualClock, WallClock
 from thermostand.foundation.errors import DeviceFault, StandError, Unreachable
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.patience import Patience
-from thermostand.foundation.repeats import RepeatLimit
-from thermostand.foundation.tasks import cancelled, watched
+from thermostand.foundation.repeat_limit import RepeatLimit
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
+from thermostand.foundation.tasks import cancel_all, run_with_background
 from thermostand.recording.writing.disk import FILES_LINE, LATCH_LINE, DiskProcess
 from thermostand.stand.assembly import Assembly, assemble
 from thermostand.stand.config.stand_config import StandConfig
@@ -27,8 +27,8 @@ from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import Recording
 from thermostand.stand.guarding.rules import Announcements
 from thermostand.stand.poller import Poller
-from thermostand.stand.running.opening.claim import claimed, latch_file
 from thermostand.stand.running.opening.holds import keep_shut_in_holds
+from thermostand.stand.running.opening.stand_lock import find_latch_file, lock_stand
 from thermostand.stand.running.opening.stop import Stop
 
 _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
@@ -41,12 +41,12 @@ Result = TypeVar("Result")
 class RunRecorder(Recording, Protocol):
     """Of what is recorded now, by a run or between runs."""
 
-    def refound(self) -> None:
+    def recover_folder(self) -> None:
         """An operator has reset the loss of its folder."""
         ...
 
 
-class RunGuest(Protocol):
+class RunHandle(Protocol):
     """The run that has the stand."""
 
     @property
@@ -67,19 +67,21 @@ class OpenStand:
     """The open stand. `recorder` is what heat depends on; set it before `prepare`.
 
     is_for_one: it is closed with its one guest; else a trip stays until an operator resets it, guest or not. latch:
-    whether the stand has tripped. background: tasks that must not end, from the opening on. patience: with the disk,
-    when the last guest has left and the stand is safe.
+    whether the stand has tripped. background: tasks that must not end, from the opening on.
+    shutdown_deadline: with the disk, when the last guest has left and the stand is safe.
     """
 
-    def __init__(self, assembly: Assembly, disk: DiskProcess | None, patience: Patience, *, is_for_one: bool) -> None:
+    def __init__(
+        self, assembly: Assembly, disk: DiskProcess | None, deadline: ShutdownDeadline, *, is_for_one: bool
+    ) -> None:
         self.assembly = assembly
         self.latch = assembly.stand.latch
         self.disk = disk
-        self.patience = patience
+        self.shutdown_deadline = deadline
         self.is_for_one = is_for_one
         self.background: list[asyncio.Task[None]] = []
         self.recorder: RunRecorder | None = None
-        self.guest: RunGuest | None = None
+        self.guest: RunHandle | None = None
         self._announced = Announcements()
         self._guard: Guard | None = None
         self._pollers: tuple[Poller, ...] = ()
@@ -97,8 +99,8 @@ class OpenStand:
         again, which is returned in words; "" when nothing is wrong."""
         if self.latch.fault is not None:
             self._release()
-            self.guard.hold_again()
-        return "" if self._guard is None else self._guard.still_wrong()
+            self.guard.recheck_holds()
+        return "" if self._guard is None else self._guard.describe_remaining_faults()
 
     def is_well(self) -> bool:
         """Whether the guard looks as often as it must, and finds nothing."""
@@ -113,8 +115,8 @@ class OpenStand:
         """Guard and pollers, unless there are some. From now on nothing is permitted without the guard."""
         if self._guard is not None:
             return
-        self._pollers = self.assembly.pollers()
-        self._guard = self.assembly.guard(
+        self._pollers = self.assembly.make_pollers()
+        self._guard = self.assembly.make_guard(
             self._trip,
             self._hold,
             self._release,
@@ -122,7 +124,7 @@ class OpenStand:
             self._frames_are_due,
             self._announced,
         )
-        self._guard.keeps_on = not self.is_for_one
+        self._guard.keeps_running = not self.is_for_one
 
     async def read_once(self) -> None:
         """Every device is read and published now; DeviceError the first time, when one cannot be read."""
@@ -137,55 +139,55 @@ class OpenStand:
         works = [
             *(poller.run() for poller in self._pollers),
             self.guard.run(),
-            stand.chamber.keeper.run(),
+            stand.chamber.permit_renewer.run(),
             *((keep_shut_in_holds(stand, hub, clock),) if self.assembly.config.flap is not None else ()),
-            stand.imaging.supply.opening.keep_open(),
+            stand.imaging.supply.recovery.keep_open(),
         ]
         self._tasks.extend(map(asyncio.create_task, works))
 
-    async def or_safe(self, work: Coroutine[None, None, Result], stop: Stop) -> Result:
+    async def run_or_make_safe(self, work: Coroutine[None, None, Result], stop: Stop) -> Result:
         """What `work` returns; when it fails or is stopped before anything was permitted, all that already answers is
         made safe."""
         try:
-            return await watched(work, self.tasks)
+            return await run_with_background(work, self.tasks)
         except BaseException:
-            stop.taking_down()
+            stop.begin_takedown()
             safety = self.assembly.stand.safety
             safety.demand()
             try:
-                await safety.confirmed(min(_OPENING_SAFE_LIMIT_S, self.assembly.config.guard.safe_limit_s))
+                await safety.wait_until_confirmed(min(_OPENING_SAFE_LIMIT_S, self.assembly.config.guard.safe_limit_s))
             finally:
                 if not self._tasks:
                     await safety.close()
             raise
 
-    async def rest(self, tasks: Sequence[asyncio.Task[None]] = ()) -> None:
+    async def make_safe_and_stop(self, tasks: Sequence[asyncio.Task[None]] = ()) -> None:
         """The actuators safe, tried until they confirm it, and the guest's `tasks` ended, with the last guest all that
         could move them; then one more look at every device, so that a recording ends with the safe state as read from
         the wire."""
         safety = self.assembly.stand.safety
         try:
             safety.demand()
-            await safety.confirmed(self.assembly.config.guard.safe_limit_s)
+            await safety.wait_until_confirmed(self.assembly.config.guard.safe_limit_s)
         finally:
-            await cancelled([*tasks, *(self._tasks if self.is_for_one else ())])
+            await cancel_all([*tasks, *(self._tasks if self.is_for_one else ())])
             if self.is_for_one:
                 await safety.close()
         for poller in self._pollers:
             await poller.poll()
 
-    async def hurry(self) -> None:
+    async def start_shutdown_deadline(self) -> None:
         """Nobody waits long for a disk once the stand is safe."""
-        await self.assembly.stand.safety.settled()
-        self.patience.begin()
+        await self.assembly.stand.safety.wait_until_settled()
+        self.shutdown_deadline.begin()
 
     async def close(self) -> None:
         """Safe for the last time; may be called when nothing was started."""
         self.is_for_one = True
         if self._tasks:
-            await self.rest()
+            await self.make_safe_and_stop()
 
-    def unrecorded(self) -> None:
+    def end_recording(self) -> None:
         """The recording has ended, and nothing is heated before there is another one."""
         self.recorder = None
         if self._guard is not None:
@@ -197,12 +199,12 @@ class OpenStand:
         if self.is_for_one:
             return
         stand = self.assembly.stand
-        self.latch.bar()
+        self.latch.hold_gate()
         for reason in (STOPPING, OPERATOR, CAMERA_LOST, DISK_LOW, NOT_RECORDED):
             stand.gate.clear(reason)
         self._announced.forget()
-        stand.table.forget()
-        stand.safety.renew()
+        stand.table.forget_positions()
+        stand.safety.reset_give_up()
         stand.attended = False
 
     def _trip(self, fault: Fault) -> None:
@@ -211,7 +213,7 @@ class OpenStand:
         return self.guest.trip(fault)
 
     def _hold(self, fault: Fault) -> None:
-        self.latch.bar()
+        self.latch.hold_gate()
         if self.guest is not None:
             self.guest.hold(fault)
 
@@ -222,11 +224,11 @@ class OpenStand:
     def _release(self) -> None:
         """The guard's hold is over. Of a folder that is lost another one is made."""
         self.latch.reset()
-        self.assembly.stand.chamber.permits.forgive()
-        self.assembly.stand.safety.forgive()
+        self.assembly.stand.chamber.permits.clear_intrusions()
+        self.assembly.stand.safety.cancel_pending()
         if self.recorder is not None:
-            self.recorder.refound()
-        self.guard.begin_again()
+            self.recorder.recover_folder()
+        self.guard.reset_grace_times()
 
 
 class _Recorded:
@@ -249,7 +251,9 @@ class _Recorded:
 
 
 @asynccontextmanager
-async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_one: bool) -> AsyncGenerator[OpenStand]:
+async def open_assembly(
+    assembly: Assembly, time: Time | None, stop: Stop, *, is_for_one: bool
+) -> AsyncGenerator[OpenStand]:
     """The stand, open and harmless: heat and cold have lost what permission somebody left them, the flap is closed and
     the relay board's timer tested. Everything is closed at the end; what moves has to be safe before that.
 
@@ -259,25 +263,25 @@ async def opened(assembly: Assembly, time: Time | None, stop: Stop, *, is_for_on
         disk = None if isinstance(assembly.clock, VirtualClock) else DiskProcess()
         latch = None
         if disk is not None:
-            latch = await asyncio.to_thread(latch_file, assembly.config)
-            stack.push_async_callback(disk.ended_within, stop.patience)
-            assembly.stand.chamber.compressor_file.through(disk.line(FILES_LINE).run)
+            latch = await asyncio.to_thread(find_latch_file, assembly.config)
+            stack.push_async_callback(disk.end_within, stop.shutdown_deadline)
+            assembly.stand.chamber.compressor_file.delegate_to(disk.line(FILES_LINE).run)
             latch.run = disk.line(LATCH_LINE).run
-        stack.push_async_callback(assembly.stand.chamber.compressor_file.close, stop.patience)
-        open_stand = OpenStand(assembly, disk, stop.patience, is_for_one=is_for_one)
+        stack.push_async_callback(assembly.stand.chamber.compressor_file.close, stop.shutdown_deadline)
+        open_stand = OpenStand(assembly, disk, stop.shutdown_deadline, is_for_one=is_for_one)
         assembly.stand.latch.file = latch
-        stack.push_async_callback(cancelled, open_stand.background)
+        stack.push_async_callback(cancel_all, open_stand.background)
         if time is not None:
             open_stand.background.append(asyncio.create_task(time()))
         stack.push_async_callback(close_devices, assembly)
-        stack.callback(assembly.stand.gate.let_go)
-        stack.push_async_callback(stop.settled)
+        stack.callback(assembly.stand.gate.remove_listeners)
+        stack.push_async_callback(stop.wait_until_aborted)
         stop.watch(assembly.stand)
-        await open_stand.or_safe(_open(assembly, is_for_one=is_for_one), stop)
+        await open_stand.run_or_make_safe(_open_devices(assembly, is_for_one=is_for_one), stop)
         yield open_stand
 
 
-async def _open(assembly: Assembly, *, is_for_one: bool) -> None:
+async def _open_devices(assembly: Assembly, *, is_for_one: bool) -> None:
     """Connect everything; nothing may heat, cool or move before that. DeviceFault when the one run it is for could not
     control: its set-point would not be in force."""
     devices, stand = assembly.devices, assembly.stand
@@ -296,7 +300,7 @@ async def _open(assembly: Assembly, *, is_for_one: bool) -> None:
         if hasattr(device, "make_safe"):
             stand.opened(cast("Actuator", device))
         if device is devices.relays:
-            await stand.chamber.permits.withdraw_left_on()
+            await stand.chamber.permits.switch_off_left_on()
         elif device is devices.flap:
             await devices.flap.move_closed()
         elif device is devices.regulator:
@@ -306,26 +310,26 @@ async def _open(assembly: Assembly, *, is_for_one: bool) -> None:
     await stand.chamber.test_dead_man()
 
 
-async def made_safe(assembly: Assembly, stop: Stop) -> tuple[str, ...]:
+async def make_safe(assembly: Assembly, stop: Stop) -> tuple[str, ...]:
     """At the end of a stand without a guard: all that may have moved is safe, confirmed; what has not confirmed it
     within guard.safe_limit_s."""
-    stop.taking_down()
-    await stop.settled()
+    stop.begin_takedown()
+    await stop.wait_until_aborted()
     safety = assembly.stand.safety
     safety.demand()
-    await safety.confirmed(assembly.config.guard.safe_limit_s)
+    await safety.wait_until_confirmed(assembly.config.guard.safe_limit_s)
     await safety.close()
     return safety.unconfirmed
 
 
 @asynccontextmanager
-async def at_bench(config: StandConfig, command: str) -> AsyncGenerator[Assembly]:
+async def open_bench(config: StandConfig, command: str) -> AsyncGenerator[Assembly]:
     """A stand that is looked at without a run: locked as for one, nothing is open, and at the end every wire is let go.
 
     InUse when another program has it: then nothing was touched. ConfigError as `assemble`.
     """
     async with AsyncExitStack() as stack:
-        await stack.enter_async_context(claimed(config, None, command))
+        await stack.enter_async_context(lock_stand(config, None, command))
         assembly = assemble(config, Hub(RepeatLimit()), WallClock())
         stack.push_async_callback(assembly.stand.chamber.compressor_file.close)
         stack.push_async_callback(close_devices, assembly)
@@ -334,10 +338,10 @@ async def at_bench(config: StandConfig, command: str) -> AsyncGenerator[Assembly
 
 async def close_devices(assembly: Assembly) -> None:
     """Let go of every wire; actuators stay as they are."""
-    await asyncio.gather(*(_let_go(device.close()) for device in assembly.devices.every.values()))
+    await asyncio.gather(*(_close_quietly(device.close()) for device in assembly.devices.every.values()))
     await assembly.bus.close()
 
 
-async def _let_go(closing: Coroutine[None, None, None]) -> None:
+async def _close_quietly(closing: Coroutine[None, None, None]) -> None:
     with suppress(StandError):  # closing never decides a run, and one device must not keep the others from it
         await closing

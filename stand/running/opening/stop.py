@@ -7,9 +7,9 @@ import signal
 from collections.abc import Callable
 
 from thermostand.foundation.errors import Interrupted, SessionError, StandTripped
-from thermostand.foundation.patience import Patience
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.stand.fault import Fault
-from thermostand.stand.gate import STOPPING, Gate, Phase, PhaseTurn, next_phase
+from thermostand.stand.gate import STOPPING, Gate, Phase, PhaseTurn, get_next_phase
 from thermostand.stand.stand import Stand
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
@@ -25,14 +25,14 @@ class Stop:
     does not confirm that it is safe, a signal a minute after the first ends the wait. Without `has_signals` the signals
     are somebody else's: those of a daemon, whose guest is stopped.
 
-    patience: how long a disk is waited for once the stand is safe; a run that has ended by itself, and is stopped while
-    it waits, has no more time than another.
+    shutdown_deadline: how long a disk is waited for once the stand is safe; a run that has ended by itself, and is
+    stopped while it waits, has no more time than another.
     """
 
     def __init__(self, *, has_signals: bool = True) -> None:
         self.reason: Fault | None = None  # why the run ends, by the first stop
         self.phase = Phase.IDLE
-        self.patience = Patience()
+        self.shutdown_deadline = ShutdownDeadline()
         self._stand: Stand | None = None
         self._aborting: asyncio.Task[None] | None = None
         self._signals = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT] if has_signals else []
@@ -49,7 +49,7 @@ class Stop:
         self._stand = stand
         stand.gate.subscribe(lambda reason, held: self._follow(stand.gate))
 
-    def started(self) -> None:
+    def begin(self) -> None:
         """The plan begins."""
         self._turn(PhaseTurn.START)
         if self._stand is not None:
@@ -57,14 +57,14 @@ class Stop:
 
     def __call__(self, fault: Fault = STOPPED) -> None:
         """Bar motion at once, begin to make safe, and return; the run is cancelled when every actuator was tried."""
-        if self._begins(fault) and self._stand is not None:
+        if self._begin_stop(fault) and self._stand is not None:
             self._stand.safety.demand()
 
     def trip(self, fault: Fault) -> None:
         """The same, for the guard, which demands by itself that the stand is made safe, as soon as this returns."""
-        self._begins(fault)
+        self._begin_stop(fault)
 
-    def _begins(self, fault: Fault) -> bool:
+    def _begin_stop(self, fault: Fault) -> bool:
         """Nothing moves from now on; whether this stop is the first."""
         self.reason = self.reason or fault
         if self._stand is not None:
@@ -73,7 +73,7 @@ class Stop:
             if self._stand is not None and fault.rule == STOPPED_BY_OPERATOR:
                 self._stand.safety.give_up()
             if self.phase is Phase.ENDED:
-                self.patience.begin()
+                self.shutdown_deadline.begin()
             return False
         self._turn(PhaseTurn.STOP)
         if self._stand is None:
@@ -82,11 +82,11 @@ class Stop:
             self._aborting = asyncio.create_task(self._abort(self._stand))
         return True
 
-    def taking_down(self) -> None:
+    def begin_takedown(self) -> None:
         """From here on the run makes safe and cleans up by itself and must not be cancelled."""
         self._turn(PhaseTurn.TAKE_DOWN)
 
-    async def settled(self) -> None:
+    async def wait_until_aborted(self) -> None:
         """From here on nothing is cancelled: the clock and the wires may go."""
         self._turn(PhaseTurn.TAKE_DOWN)
         if self._aborting is not None:
@@ -96,11 +96,11 @@ class Stop:
         """The plan has ended, whichever way, and the stand is safe."""
         self._turn(PhaseTurn.END)
         if self.reason is not None:
-            self.patience.begin()
+            self.shutdown_deadline.begin()
 
     async def _abort(self, stand: Stand) -> None:
         try:
-            await stand.safety.tried()
+            await stand.safety.wait_until_tried()
         finally:
             if self.phase is Phase.ABORTING:
                 self._turn(PhaseTurn.TAKE_DOWN)
@@ -110,7 +110,7 @@ class Stop:
         self._turn(PhaseTurn.HOLD if gate.reasons else PhaseTurn.RELEASE)
 
     def _turn(self, turn: PhaseTurn) -> None:
-        self.phase = next_phase(self.phase, turn)
+        self.phase = get_next_phase(self.phase, turn)
 
     async def __aenter__(self) -> Stop:
         running = asyncio.current_task()

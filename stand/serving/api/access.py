@@ -30,13 +30,13 @@ from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
 from thermostand.stand.config.interface_section import TokenFile
-from thermostand.stand.serving.api.stream import json_of
-from thermostand.stand.serving.desk import Who
+from thermostand.stand.serving.api.stream import make_json
+from thermostand.stand.serving.api_models import Who
 
 # The tokens of a stand as they are now: read at the start, and again when that is asked for.
 
 
-class TokenBook:
+class TokenStore:
     """known: None where no file is named, so that nobody needs a token; with an empty file nobody has one. `renew` may
     be called by any thread."""
 
@@ -116,7 +116,7 @@ class Access:
     """hosts: names under which the stand is reached besides this machine's own. Logins are one-time codes and what
     became of them: both live as long as the daemon, and no longer than the token that asked for them."""
 
-    tokens: TokenBook = field(default_factory=TokenBook)
+    tokens: TokenStore = field(default_factory=TokenStore)
     hosts: Iterable[str] = ()
     trusts_loopback: bool | Literal["read-only"] = False
 
@@ -126,7 +126,7 @@ class Access:
         self._codes: dict[str, _Login] = {}
         self._logins: dict[str, _Login] = {}
 
-    def login_code(self, who: Who, *, read_only: bool = False) -> str:
+    def make_login_code(self, who: Who, *, read_only: bool = False) -> str:
         """A code that opens the page once, within ten minutes, for who asks for it, or for one who may only look."""
         now_s = time.monotonic()
         self._codes = {code: entry for code, entry in self._codes.items() if entry.until_s > now_s}
@@ -134,14 +134,14 @@ class Access:
             del self._codes[next(iter(self._codes))]
         code = secrets.token_urlsafe(24)
         holder = Who(name=who.name, how="token", read_only=who.read_only or read_only)
-        of = self._token(who.name) if who.how == "token" else None
+        of = self._find_token(who.name) if who.how == "token" else None
         self._codes[_hash(code)] = _Login(holder, of, now_s + _LOGIN_S)
         return code
 
     def log_in(self, code: str) -> str:
         """The cookie of who has the code, which is worth nothing from now on; "" when it is none."""
         login = self._codes.pop(_hash(code), None)
-        if login is None or not self._holds(login):
+        if login is None or not self._is_valid(login):
             return ""
         while len(self._logins) >= _MOST_LOGINS:
             del self._logins[next(iter(self._logins))]
@@ -149,12 +149,12 @@ class Access:
         self._logins[_hash(cookie)] = replace(login, until_s=time.monotonic() + _SESSION_S)
         return cookie
 
-    def who(self, scope: Scope) -> Who | None:
+    def identify(self, scope: Scope) -> Who | None:
         """Who asks; None when that has to be proved and is not. Denied when what is given as proof is none."""
         state, headers = cast("dict[str, Any]", scope.get("state") or {}), cast("Headers", scope["headers"])
         if state.get("door") == "socket":
-            return Who(name=user_name(state.get("uid")), how="socket")
-        found = self._of_token(headers) or self._of_cookie(headers)
+            return Who(name=get_user_name(state.get("uid")), how="socket")
+        found = self._identify_by_token(headers) or self._identify_by_cookie(headers)
         if found is not None:
             return found
         needs_token = self.tokens.known is not None and not self.trusts_loopback
@@ -165,27 +165,29 @@ class Access:
     def admit(self, scope: Scope) -> Who:
         """Who asks and may, whoever is asked for whatever; Denied."""
         self.check(scope)
-        who = self.who(scope)
-        if who is None and not is_open(scope["path"]):
+        who = self.identify(scope)
+        if who is None and not is_exempt_from_token(scope["path"]):
             raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
         if who is not None and who.read_only and _may_change(scope):
-            raise Denied(403, f"{_whose(who)} may look and press STOP, but order nothing: it is read-only")
+            raise Denied(403, f"{_describe_who(who)} may look and press STOP, but order nothing: it is read-only")
         return who or Who(name="", how="network")
 
     def check(self, scope: Scope) -> None:
         """Host and Origin; Denied."""
         headers = cast("Headers", scope["headers"])
-        host = _one(headers, b"host")
-        if host is None or not self._knows(scope, host):
+        host = _get_one(headers, b"host")
+        if host is None or not self._is_known_host(scope, host):
             raise Denied(403, "this stand is not reached under that host name; name it in interface.hosts of its file")
         if scope["type"] == "http" and scope["method"] in _READS:
             return
-        origins = _all(headers, b"origin")
-        if any(not _is_same(origin, host) for origin in origins) or "cross-site" in _all(headers, b"sec-fetch-site"):
+        origins = _get_all(headers, b"origin")
+        if any(not _is_same(origin, host) for origin in origins) or "cross-site" in _get_all(
+            headers, b"sec-fetch-site"
+        ):
             raise Denied(403, "this is not done for the page of another site")
 
-    def _knows(self, scope: Scope, host: str) -> bool:
-        name = _name_of(host)
+    def _is_known_host(self, scope: Scope, host: str) -> bool:
+        name = _parse_host_name(host)
         if name in self._names:
             return True
         try:
@@ -195,38 +197,38 @@ class Access:
         server = scope.get("server")
         return bool(server) and str(ip) == str(server[0]).partition("%")[0]  # an address cannot be rebound
 
-    def _of_token(self, headers: Headers) -> Who | None:
-        given = _all(headers, b"authorization")
+    def _identify_by_token(self, headers: Headers) -> Who | None:
+        given = _get_all(headers, b"authorization")
         if not given:
             return None
         kind, _, token = given[0].partition(" ")
         found, known = _hash(token.strip()), self.tokens.known or TokenFile()
         matches = [
             Who(name=name, how="token", read_only=read_only)
-            for name, (each, read_only) in known.by_name().items()
+            for name, (each, read_only) in known.list_by_name().items()
             if hmac.compare_digest(_hash(each), found)
         ]
         if len(given) > 1 or kind.lower() != "bearer" or not matches:
             raise Denied(401, "the Authorization header has no token of this stand")
         return matches[0]
 
-    def _of_cookie(self, headers: Headers) -> Who | None:
-        cookie = next((value for name, value in _cookies(headers) if name == COOKIE), None)
+    def _identify_by_cookie(self, headers: Headers) -> Who | None:
+        cookie = next((value for name, value in _parse_cookies(headers) if name == COOKIE), None)
         login = self._logins.get(_hash(cookie)) if cookie else None
-        return login.who if login is not None and self._holds(login) else None
+        return login.who if login is not None and self._is_valid(login) else None
 
-    def _holds(self, login: _Login) -> bool:
-        return time.monotonic() < login.until_s and login.of in (None, self._token(login.who.name))
+    def _is_valid(self, login: _Login) -> bool:
+        return time.monotonic() < login.until_s and login.of in (None, self._find_token(login.who.name))
 
-    def _token(self, name: str) -> tuple[str, bool] | None:
+    def _find_token(self, name: str) -> tuple[str, bool] | None:
         """That of a name, and whether it is read-only."""
-        return (self.tokens.known or TokenFile()).by_name().get(name)
+        return (self.tokens.known or TokenFile()).list_by_name().get(name)
 
 
 Headers = Iterable[tuple[bytes, bytes]]
 
 
-def user_name(uid: object) -> str:
+def get_user_name(uid: object) -> str:
     """The user of that number; the number when it has no name."""
     if not isinstance(uid, int):
         return ""
@@ -236,7 +238,7 @@ def user_name(uid: object) -> str:
         return str(uid)
 
 
-def uid_of(connection: socket.socket) -> int | None:
+def get_peer_uid(connection: socket.socket) -> int | None:
     """The user at the other end of a Unix socket."""
     with suppress(OSError):
         return _PEER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
@@ -254,8 +256,8 @@ def is_loopback(host: str) -> bool:
 
 
 def _is_local(scope: Scope, headers: Headers) -> bool:
-    client, host = scope.get("client"), _one(headers, b"host")
-    if not client or not is_loopback(str(client[0])) or host is None or _name_of(host) not in _LOOPBACK:
+    client, host = scope.get("client"), _get_one(headers, b"host")
+    if not client or not is_loopback(str(client[0])) or host is None or _parse_host_name(host) not in _LOOPBACK:
         return False
     return not any(name in _PROXIED for name, _ in headers)
 
@@ -264,16 +266,16 @@ def _hash(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _all(headers: Headers, name: bytes) -> list[str]:
+def _get_all(headers: Headers, name: bytes) -> list[str]:
     return [value.decode("latin-1").strip() for key, value in headers if key == name]
 
 
-def _one(headers: Headers, name: bytes) -> str | None:
-    found = _all(headers, name)
+def _get_one(headers: Headers, name: bytes) -> str | None:
+    found = _get_all(headers, name)
     return found[0] if len(found) == 1 else None
 
 
-def _name_of(host: str) -> str | None:
+def _parse_host_name(host: str) -> str | None:
     """The name in `name:port` or `[address]:port`, None when it is neither."""
     if not host or any(character in host for character in "/@?#\\ "):
         return None
@@ -289,25 +291,25 @@ def _is_same(origin: str, host: str) -> bool:
     try:
         parts = urlsplit(origin)
         port, scheme = parts.port, parts.scheme
-        there = urlsplit(f"//{host}")
+        remote = urlsplit(f"//{host}")
         return (
             scheme in ("http", "https")
             and parts.hostname is not None
-            and parts.hostname == there.hostname
-            and (port or (443 if scheme == "https" else 80)) == (there.port or (443 if scheme == "https" else 80))
+            and parts.hostname == remote.hostname
+            and (port or (443 if scheme == "https" else 80)) == (remote.port or (443 if scheme == "https" else 80))
         )
     except ValueError:
         return False
 
 
-def _cookies(headers: Headers) -> Iterable[tuple[str, str]]:
-    for line in _all(headers, b"cookie"):
+def _parse_cookies(headers: Headers) -> Iterable[tuple[str, str]]:
+    for line in _get_all(headers, b"cookie"):
         for part in line.split(";"):
             name, _, value = part.strip().partition("=")
             yield name, value
 
 
-def is_open(path: str) -> bool:
+def is_exempt_from_token(path: str) -> bool:
     """What needs no token: STOP, whether all is well, and the page's own files, which are no secret: it has the button
     for STOP, and gets no data without a token."""
     return path in (STOP_PATH, LOGIN_PATH, "/healthz", "/") or path.startswith("/static/")
@@ -322,13 +324,13 @@ class Gatekeeper:
         self._access = access
         self._failed = failed
         self._viewers: dict[asyncio.Task[object], Scope] = {}
-        access.tokens.watch(self._look_at_viewers)
+        access.tokens.watch(self._check_viewers)
 
-    def _look_at_viewers(self) -> None:
+    def _check_viewers(self) -> None:
         """Those who would not be let in any more have to leave."""
         for task, scope in self._viewers.items():
             with suppress(Denied):
-                if self._access.who(scope) is not None:
+                if self._access.identify(scope) is not None:
                     continue
             task.cancel()
 
@@ -336,14 +338,14 @@ class Gatekeeper:
         """One request, or one viewer."""
         if scope["type"] not in ("http", "websocket"):
             return
-        answering = _Answering(send)
+        answering = _HeaderSender(send)
         try:
             who = self._access.admit(scope)
             scope["state"] = {**(scope.get("state") or {}), "who": who}
             if scope.get("method") == "HEAD":  # as GET; uvicorn sends the head of its answer only
                 scope = {**scope, "method": "GET"}
             if scope["type"] == "http" and scope["path"] != STOP_PATH:
-                receive = await _whole_body(scope, receive)
+                receive = await _read_body(scope, receive)
             if scope["type"] == "websocket":
                 await self._view(scope, receive, answering)
             else:
@@ -369,7 +371,7 @@ class Gatekeeper:
         viewing.result()
 
 
-class _Answering:
+class _HeaderSender:
     """Adds the headers that every answer has, unless the route has given its own. Each ends its connection: STOP is
     looked for in what a connection says first (stop_thread.py), and a browser would send it behind what the page has
     asked for on another one."""
@@ -394,17 +396,17 @@ def _may_change(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] not in _READS and scope["path"] not in _CHANGES_NOTHING
 
 
-def _whose(who: Who) -> str:
+def _describe_who(who: Who) -> str:
     return f"the token of {who.name}" if who.how == "token" else "this machine, without a token,"
 
 
 def _is_in_chunks(scope: Scope) -> bool:
-    return bool(_all(scope["headers"], b"transfer-encoding"))
+    return bool(_get_all(scope["headers"], b"transfer-encoding"))
 
 
-async def _whole_body(scope: Scope, receive: Receive) -> Receive:
+async def _read_body(scope: Scope, receive: Receive) -> Receive:
     """The body, within its limits, before anything is done for it. Denied when it is longer or slower."""
-    if (length := _one(scope["headers"], b"content-length")) is not None:
+    if (length := _get_one(scope["headers"], b"content-length")) is not None:
         if not length.isdecimal() or int(length) > BODY_LIMIT_BYTES:
             raise Denied(413, f"a request has at most {BODY_LIMIT_BYTES} bytes")
     elif _is_in_chunks(scope):
@@ -437,7 +439,7 @@ async def _whole_body(scope: Scope, receive: Receive) -> Receive:
     return given
 
 
-async def _refuse(scope: Scope, send: _Answering, status: int, sentence: str) -> None:
+async def _refuse(scope: Scope, send: _HeaderSender, status: int, sentence: str) -> None:
     if send.has_begun and scope["type"] == "http":
         return
     prefix = "http" if scope["type"] == "http" else "websocket.http"
@@ -446,24 +448,24 @@ async def _refuse(scope: Scope, send: _Answering, status: int, sentence: str) ->
         with suppress(RuntimeError):  # it is closed
             await send({"type": "websocket.close", "code": 1008, "reason": sentence})
         return
-    body = json_of({"error": sentence}).encode()
-    headers = _headers(status, body)
+    body = make_json({"error": sentence}).encode()
+    headers = _make_headers(status, body)
     await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
     await send({"type": f"{prefix}.response.body", "body": body})
 
 
-def _headers(status: int, body: bytes) -> list[tuple[bytes, bytes]]:
+def _make_headers(status: int, body: bytes) -> list[tuple[bytes, bytes]]:
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
     return [*headers, (b"www-authenticate", b"Bearer")] if status == 401 else headers
 
 
-def last_answer(status: int, body: bytes) -> bytes:
+def make_last_answer(status: int, body: bytes) -> bytes:
     """A whole answer with this JSON, after which the connection ends."""
-    headers = (*_headers(status, body), *_HEADERS, (b"connection", b"close"))
+    headers = (*_make_headers(status, body), *_HEADERS, (b"connection", b"close"))
     lines = (f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode(), *map(b": ".join, headers), b"", body)
     return b"\r\n".join(lines)
 
 
-def last_refusal(status: int, sentence: str) -> bytes:
-    """As `last_answer`."""
-    return last_answer(status, json_of({"error": sentence}).encode())
+def make_last_refusal(status: int, sentence: str) -> bytes:
+    """As `make_last_answer`."""
+    return make_last_answer(status, make_json({"error": sentence}).encode())

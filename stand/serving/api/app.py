@@ -11,16 +11,16 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from thermostand.foundation.document_faults import path_text
+from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
 from thermostand.stand.serving.api.access import FAILED, Access, App, Gatekeeper
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
-from thermostand.stand.serving.api.doors import Interface
-from thermostand.stand.serving.api.order_routes import commands
-from thermostand.stand.serving.api.reads import reads
-from thermostand.stand.serving.api.recorded import recorded
-from thermostand.stand.serving.api.stream import Stream, json_of
-from thermostand.stand.serving.desk import Conflict, Missing
+from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.api.order_routes import make_command_routes
+from thermostand.stand.serving.api.read_routes import make_read_routes
+from thermostand.stand.serving.api.session_routes import make_session_routes
+from thermostand.stand.serving.api.stream import Stream, make_json
+from thermostand.stand.serving.api_models import Conflict, Missing
 
 # What was raised -> the answer's status; the first that fits.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
@@ -57,16 +57,16 @@ def make_app(
         redirect_slashes=False,
         responses=dict.fromkeys(_REFUSED, _ERROR),
     )
-    app.include_router(reads(bridge, stream, access, interface.url))
-    app.include_router(commands(bridge))
-    app.include_router(recorded(bridge, interface.sessions))
-    for room in interface.rooms:
-        app.include_router(room(bridge))
+    app.include_router(make_read_routes(bridge, stream, access, interface.url))
+    app.include_router(make_command_routes(bridge))
+    app.include_router(make_session_routes(bridge, interface.sessions))
+    for routes in interface.extra_routes:
+        app.include_router(routes(bridge))
     for kind, status in _STATUS:
-        app.add_exception_handler(kind, _answer_with(status))
-    app.add_exception_handler(Exception, _failed)
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(HTTPException, _refused)
+        app.add_exception_handler(kind, _make_handler(status))
+    app.add_exception_handler(Exception, _handle_failure)
+    app.add_exception_handler(RequestValidationError, _handle_validation_error)
+    app.add_exception_handler(HTTPException, _handle_http_error)
     return Gatekeeper(cast("App", app), access, failed)
 
 
@@ -82,19 +82,19 @@ _ERROR: dict[str, Any] = {
 }
 
 
-def _answer_with(status: int) -> Callable[[Request, Exception], Response]:
-    return lambda _, error: _error(status, str(error))
+def _make_handler(status: int) -> Callable[[Request, Exception], Response]:
+    return lambda _, error: _make_error(status, str(error))
 
 
-def _refused(request: Request, error: Exception) -> Response:
+def _handle_http_error(request: Request, error: Exception) -> Response:
     refused = cast("HTTPException", error)
     more = {404: "there is no such address; /openapi.json has those there are", 405: "this is not done at this address"}
     text = more.get(refused.status_code, str(refused.detail))
-    headers = {"Allow": ", ".join(_allowed(request))} if refused.status_code == 405 else refused.headers
-    return _error(refused.status_code, text, headers)
+    headers = {"Allow": ", ".join(_list_allowed_methods(request))} if refused.status_code == 405 else refused.headers
+    return _make_error(refused.status_code, text, headers)
 
 
-def _allowed(request: Request) -> list[str]:
+def _list_allowed_methods(request: Request) -> list[str]:
     """What is done at this address, by any of its routes; HEAD is answered where GET is."""
     scope = {"type": "http", "path": request.scope["path"], "root_path": "", "headers": []}
 
@@ -105,9 +105,9 @@ def _allowed(request: Request) -> list[str]:
     return sorted(found | ({"HEAD"} if "GET" in found else set()))
 
 
-def _failed(_: Request, error: Exception) -> Response:
+def _handle_failure(_: Request, error: Exception) -> Response:
     """What should not happen; the gatekeeper gets it as well."""
-    return _error(500, FAILED.format(type(error).__name__))
+    return _make_error(500, FAILED.format(type(error).__name__))
 
 
 _SENTENCES = {
@@ -118,7 +118,7 @@ _SENTENCES = {
 }
 
 
-def _invalid(_: Request, error: Exception) -> Response:
+def _handle_validation_error(_: Request, error: Exception) -> Response:
     """Where, and what is wrong there; not what was sent, which may be secret or long."""
     faults = cast("RequestValidationError", error).errors()
     sentences: list[str] = []
@@ -126,11 +126,11 @@ def _invalid(_: Request, error: Exception) -> Response:
         if fault["type"] == "json_invalid":
             sentences.append(f"the body: is no JSON from character {int(fault['loc'][-1]) + 1} on")
             continue
-        where = path_text(part for part in fault["loc"] if part not in ("body", "query", "path", "header"))
+        where = format_path(part for part in fault["loc"] if part not in ("body", "query", "path", "header"))
         sentences.append(f"{where or 'the body'}: {_SENTENCES.get(fault['type'], fault['msg'])}")
-    return _error(422, "; ".join(sentences) or "the request is not understood")
+    return _make_error(422, "; ".join(sentences) or "the request is not understood")
 
 
-def _error(status: int, sentence: str, headers: Mapping[str, str] | None = None) -> Response:
+def _make_error(status: int, sentence: str, headers: Mapping[str, str] | None = None) -> Response:
     text = sentence.encode("utf-8", "replace").decode()
-    return Response(json_of({"error": text}), status, dict(headers or {}), "application/json")
+    return Response(make_json({"error": text}), status, dict(headers or {}), "application/json")

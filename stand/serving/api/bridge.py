@@ -26,9 +26,9 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.events import COMMAND
 from thermostand.foundation.items import Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame
-from thermostand.foundation.tasks import failure_text
+from thermostand.foundation.tasks import describe_failure
+from thermostand.stand.serving.api_models import Done, PlanCheck, PlanStep, StandState, Who, WrittenStep
 from thermostand.stand.serving.commands import STOP, Served
-from thermostand.stand.serving.desk import Done, PlanCheck, PlanStep, StandState, Who, WrittenStep
 
 _REFRESH_S = 0.5  # twice a second, as often as a person sees a change
 _SOONEST_S = 0.05  # between two snapshots of a stand of which much is published
@@ -76,7 +76,7 @@ class Bridge:
         self._clock = service.clock
         self._loop = asyncio.get_running_loop()
         self._items: deque[tuple[int, int, Item]] = deque(maxlen=_QUEUE)
-        self._seq = first_seq()
+        self._seq = choose_first_seq()
         self._command_seq = 0
         self._plan: tuple[PlanStep, ...] | None = None
         self._plan_at_s = 0.0
@@ -124,7 +124,7 @@ class Bridge:
             state = self._service.state().model_copy(update={"seq": self._seq})
             self.snapshot, self.failure = StateSnapshot(state, time.monotonic()), ""
         except Exception as error:  # noqa: BLE001 - clients see that it is old; the run does not depend on them
-            self.failure = failure_text(error)
+            self.failure = describe_failure(error)
         self._next = None
         self._refresh_within(_REFRESH_S)
 
@@ -144,14 +144,16 @@ class Bridge:
         """What `call` gives on the control loop, or what it raises. NoAnswer when that takes longer than `limit_s`:
         it may still be done."""
         answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
-        self._hand_over(lambda: self._called(call, answer))
-        return await _within(limit_s, asyncio.wrap_future(answer))
+        self._post(lambda: self._call(call, answer))
+        return await _wait_within(limit_s, asyncio.wrap_future(answer))
 
     async def perform(self, name: str, who: Who, given: Document | None = None) -> BaseModel:
         """Do a command, as `ask`; Done has the number of its event."""
-        return await self.ask(self._numbered(name, who, given))
+        return await self.ask(self._perform_numbered(name, who, given))
 
-    def _numbered(self, name: str, who: Who, given: Document | None) -> Callable[[Served], Awaitable[BaseModel]]:
+    def _perform_numbered(
+        self, name: str, who: Who, given: Document | None
+    ) -> Callable[[Served], Awaitable[BaseModel]]:
         async def numbered(service: Served) -> BaseModel:
             before = self._command_seq
             came = service.perform(name, who, given)
@@ -162,7 +164,7 @@ class Bridge:
 
         return numbered
 
-    def stopping(self, who: Who) -> concurrent.futures.Future[BaseModel]:
+    def request_stop(self, who: Who) -> concurrent.futures.Future[BaseModel]:
         """The stop that is on its way, begun if there is none; from any thread. One that follows another within 0.1 s
         is done when these are over, with all that came until then. It ends as `ask`, but without a limit, and is not
         to be cancelled: a thousand who stop share it."""
@@ -170,22 +172,22 @@ class Bridge:
             if self._stopping is None or self._stopping.done():
                 stopping = self._stopping = concurrent.futures.Future[BaseModel]()
                 try:
-                    self._hand_over(lambda: self._begin_stop(who, stopping))
+                    self._post(lambda: self._begin_stop(who, stopping))
                 except NoAnswer as error:
                     stopping.set_exception(error)
             return self._stopping
 
     async def stop(self, who: Who) -> BaseModel:
         """Stop, as `stopping`. NoAnswer as `ask`."""
-        stopping = asyncio.wrap_future(self.stopping(who))
+        stopping = asyncio.wrap_future(self.request_stop(who))
         stopping.add_done_callback(lambda each: each.cancelled() or each.exception())  # others have it, too
-        return await _within(COMMAND_LIMIT_S, asyncio.shield(stopping))
+        return await _wait_within(COMMAND_LIMIT_S, asyncio.shield(stopping))
 
-    async def fresh(self) -> StateSnapshot:
+    async def get_fresh_snapshot(self) -> StateSnapshot:
         """The stand as it is now; the last snapshot when the control loop has no time for another one."""
         if self._refreshing is None:
             self._refreshing = asyncio.ensure_future(self.ask(lambda _: self._refresh(), _FRESH_S))
-            self._refreshing.add_done_callback(self._has_refreshed)
+            self._refreshing.add_done_callback(self._finish_refresh)
         with suppress(NoAnswer):
             await asyncio.shield(self._refreshing)
         return self.snapshot
@@ -202,12 +204,12 @@ class Bridge:
         """What an edit of the plan would say; in a thread of its own, as `plan`."""
         return await asyncio.to_thread(self._service.check_edit, from_index, steps)
 
-    def _has_refreshed(self, refreshing: asyncio.Future[None]) -> None:
+    def _finish_refresh(self, refreshing: asyncio.Future[None]) -> None:
         self._refreshing = None
         if not refreshing.cancelled():
             refreshing.exception()
 
-    def _hand_over(self, call: Callable[[], None]) -> None:
+    def _post(self, call: Callable[[], None]) -> None:
         try:
             self._loop.call_soon_threadsafe(call)
         except RuntimeError:  # it is closed
@@ -219,9 +221,9 @@ class Bridge:
             self._loop.call_later(wait_s, self._begin_stop, who, stopping)
             return
         self._stopped_s = time.monotonic()
-        self._called(self._numbered(STOP, who, None), stopping)
+        self._call(self._perform_numbered(STOP, who, None), stopping)
 
-    def _called(
+    def _call(
         self, call: Callable[[Served], Result | Awaitable[Result]], answer: concurrent.futures.Future[Result]
     ) -> None:
         """On the control loop."""
@@ -231,36 +233,36 @@ class Bridge:
         try:
             result = call(self._service)
         except Exception as error:  # noqa: BLE001 - it belongs to who asked
-            _give(answer, error)
+            _set_answer(answer, error)
             return
         if inspect.isawaitable(result):
-            task = asyncio.ensure_future(self._completed(result, answer))
+            task = asyncio.ensure_future(self._complete(result, answer))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
         else:
-            _give(answer, result)
+            _set_answer(answer, result)
 
-    async def _completed(self, result: Awaitable[Result], answer: concurrent.futures.Future[Result]) -> None:
+    async def _complete(self, result: Awaitable[Result], answer: concurrent.futures.Future[Result]) -> None:
         try:
-            _give(answer, await result)
+            _set_answer(answer, await result)
         except Exception as error:  # noqa: BLE001 - it belongs to who asked
-            _give(answer, error)
+            _set_answer(answer, error)
 
 
-def no_answer(limit_s: float) -> NoAnswer:
+def make_no_answer(limit_s: float) -> NoAnswer:
     """That of a control loop which has taken longer."""
     return NoAnswer(f"the stand has not answered within {limit_s:g} s; it may still do what was asked")
 
 
-async def _within(limit_s: float, answer: Awaitable[Result]) -> Result:
+async def _wait_within(limit_s: float, answer: Awaitable[Result]) -> Result:
     try:
         async with asyncio.timeout(limit_s):  # wait_for may lose a cancellation that comes with the answer
             return await answer
     except TimeoutError:
-        raise no_answer(limit_s) from None
+        raise make_no_answer(limit_s) from None
 
 
-def _give(answer: concurrent.futures.Future[Result], result: Result | Exception) -> None:
+def _set_answer(answer: concurrent.futures.Future[Result], result: Result | Exception) -> None:
     if answer.cancelled() or not answer.set_running_or_notify_cancel():
         return
     if isinstance(result, Exception):
@@ -269,6 +271,6 @@ def _give(answer: concurrent.futures.Future[Result], result: Result | Exception)
         answer.set_result(result)
 
 
-def first_seq() -> int:
+def choose_first_seq() -> int:
     """A number that no daemon before this one has reached: its stream has fewer than 1000 items a second."""
     return (WallClock().now_ns() - _FIRST_NS) // 1_000_000

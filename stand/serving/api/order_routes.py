@@ -14,8 +14,8 @@ from pydantic.fields import FieldInfo
 
 from thermostand.foundation.documents import Document
 from thermostand.stand.serving.api.bridge import Bridge
+from thermostand.stand.serving.api_models import DeviceState, PlanCheck, PlanRequest, QueuedRun, SimulatedFaults, Who
 from thermostand.stand.serving.commands import STOP, Command
-from thermostand.stand.serving.desk import DeviceState, PlanCheck, PlanRequest, QueuedRun, SimulatedFaults, Who
 
 API = "/api/v1"
 _KEY = "idempotency_key"  # the header that does what a field `key` does
@@ -33,13 +33,13 @@ class CommandInfo(BaseModel):
     argument: dict[str, JsonValue]
 
 
-def commands(bridge: Bridge) -> APIRouter:
+def make_command_routes(bridge: Bridge) -> APIRouter:
     """The routes."""
     router = APIRouter(prefix=API)
     for each in bridge.commands.values():
         router.add_api_route(
             each.path,
-            _endpoint(bridge, each),
+            _make_endpoint(bridge, each),
             methods=[each.http],
             name=each.method,
             response_model=each.answer,
@@ -50,7 +50,7 @@ def commands(bridge: Bridge) -> APIRouter:
     @router.get("/commands", response_model=list[CommandInfo])
     async def known() -> Response:
         """What may be ordered, and how."""
-        return _list(
+        return _make_list_response(
             CommandInfo(
                 name=each.name,
                 title=each.title,
@@ -66,52 +66,54 @@ def commands(bridge: Bridge) -> APIRouter:
     @router.post("/run/plan/check", response_model=PlanCheck)
     async def check_edit(body: PlanRequest) -> Response:
         """What replacing these steps would say, step by step; changes nothing."""
-        return _json(await bridge.check_edit(body.from_index, body.steps))
+        return _make_response(await bridge.check_edit(body.from_index, body.steps))
 
     @router.get("/queue", response_model=list[QueuedRun])
     async def queue() -> Response:
         """What has ended, the run under way, and those to be done in their order."""
-        return _list(bridge.snapshot.state.queue)
+        return _make_list_response(bridge.snapshot.state.queue)
 
     @router.get("/devices", response_model=list[DeviceState])
     async def devices() -> Response:
         """What there is, and which commands it takes by hand between runs."""
-        return _list(await bridge.ask(lambda service: service.devices()))
+        return _make_list_response(await bridge.ask(lambda service: service.devices()))
 
     @router.get("/simulator/faults", response_model=SimulatedFaults)
     async def faults() -> Response:
         """What can be broken in the simulated laboratory, and what is; 409 for a real stand."""
-        return _json(await bridge.ask(lambda service: service.known_faults()))
+        return _make_response(await bridge.ask(lambda service: service.list_simulated_faults()))
 
     return router
 
 
-def _endpoint(bridge: Bridge, command: Command) -> Any:
+def _make_endpoint(bridge: Bridge, command: Command) -> Any:
     """A function with the parameters that FastAPI takes from path, header and body, for this command."""
     parameters = [inspect.Parameter("request", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Request)]
     if (argument := command.argument) is not None:
         fields = argument.model_fields
-        parameters += [_parameter(name, Annotated[_kind(fields[name]), Path()]) for name in command.in_path]
+        parameters += [_make_parameter(name, Annotated[_get_kind(fields[name]), Path()]) for name in command.in_path]
         body = {name: info for name, info in fields.items() if name not in command.in_path}
         if body:
             is_needed = any(info.is_required() for info in body.values())
-            kind = argument if len(body) == len(fields) else _part(argument, body)
-            parameters.append(_parameter("body", kind) if is_needed else _parameter("body", kind | None, None))
+            kind = argument if len(body) == len(fields) else _make_body_model(argument, body)
+            parameters.append(
+                _make_parameter("body", kind) if is_needed else _make_parameter("body", kind | None, None)
+            )
         if "key" in body:
-            parameters.append(_parameter(_KEY, Annotated[str, Header(max_length=200)], ""))
+            parameters.append(_make_parameter(_KEY, Annotated[str, Header(max_length=200)], ""))
 
     async def endpoint(request: Request, **given: Any) -> Response:
         who = cast("Who", request.state.who)
         if command.name == STOP:
-            return _json(await bridge.stop(who))
-        return _json(await bridge.perform(command.name, who, _argument(command, given)), command.status)
+            return _make_response(await bridge.stop(who))
+        return _make_response(await bridge.perform(command.name, who, _make_argument(command, given)), command.status)
 
     endpoint.__name__ = command.method
     cast("Any", endpoint).__signature__ = inspect.Signature(parameters)
     return endpoint
 
 
-def _argument(command: Command, given: dict[str, Any]) -> Document | None:
+def _make_argument(command: Command, given: dict[str, Any]) -> Document | None:
     if command.argument is None:
         return None
     body, key = given.pop("body", None), given.pop(_KEY, "")
@@ -125,15 +127,15 @@ def _argument(command: Command, given: dict[str, Any]) -> Document | None:
         raise RequestValidationError(error.errors()) from error
 
 
-def _parameter(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+def _make_parameter(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
 
 
-def _kind(info: FieldInfo) -> Any:
+def _get_kind(info: FieldInfo) -> Any:
     return Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
 
 
-def _part(argument: type[Document], body: dict[str, FieldInfo]) -> Any:
+def _make_body_model(argument: type[Document], body: dict[str, FieldInfo]) -> Any:
     """The argument without what stands in the path."""
     fields: dict[str, Any] = {name: (info.annotation, info) for name, info in body.items()}
     more = cast("Any", argument.model_config.get("json_schema_extra"))
@@ -144,9 +146,9 @@ def _part(argument: type[Document], body: dict[str, FieldInfo]) -> Any:
     return part
 
 
-def _json(value: BaseModel, status: int = 200) -> Response:
+def _make_response(value: BaseModel, status: int = 200) -> Response:
     return Response(value.model_dump_json(), status, media_type="application/json")
 
 
-def _list(values: Iterable[BaseModel]) -> Response:
+def _make_list_response(values: Iterable[BaseModel]) -> Response:
     return Response("[" + ",".join(each.model_dump_json() for each in values) + "]", media_type="application/json")

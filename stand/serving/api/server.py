@@ -19,17 +19,17 @@ from thermostand.foundation.clock import Clock
 from thermostand.foundation.errors import ConfigError, SessionError, StandError
 from thermostand.foundation.events import INTERFACE_FAILED, NO_CONTROL, EventKind
 from thermostand.foundation.hub import Hub
-from thermostand.foundation.patience import Patience
-from thermostand.foundation.tasks import failure_text
+from thermostand.foundation.shutdown_deadline import ShutdownDeadline
+from thermostand.foundation.tasks import describe_failure
 from thermostand.stand.serving.api.access import Access
 from thermostand.stand.serving.api.bridge import Bridge
-from thermostand.stand.serving.api.doors import Interface, OtherDoor
-from thermostand.stand.serving.api.stop_thread import Door, StopThread
+from thermostand.stand.serving.api.listeners import Interface, ProtocolListener
+from thermostand.stand.serving.api.stop_thread import ListenerKind, StopThread
 from thermostand.stand.serving.commands import Served
-from thermostand.stand.serving.presence import DaemonEntry, Presence
+from thermostand.stand.serving.instances import DaemonEntry, DaemonInstance
 
-_UNIX: tuple[Door, ...] = ("socket", "stop")
-_TCP: Door = "tcp"
+_UNIX: tuple[ListenerKind, ...] = ("socket", "stop")
+_TCP: ListenerKind = "tcp"
 _LOOK_S = 1.0
 _CLOSE_LIMIT_S = 5.0  # round number; nothing was measured
 _READY_LIMIT_S = 30.0  # imports take half a second or more
@@ -37,31 +37,31 @@ _READY_LIMIT_S = 30.0  # imports take half a second or more
 
 @asynccontextmanager
 async def serve(
-    service: Served, session: Path, stand: str, interface: Interface, patience: Patience | None = None
-) -> AsyncGenerator[Presence]:
+    service: Served, session: Path, stand: str, interface: Interface, deadline: ShutdownDeadline | None = None
+) -> AsyncGenerator[DaemonInstance]:
     """Answer for the daemon that runs `session` on the stand of this name while inside; at the end for as long as
-    `patience` lasts.
+    `deadline` lasts.
 
     SessionError when the runtime folder cannot be used, ConfigError when it cannot listen at the port. A socket or
     entry that somebody removes is made again within some seconds.
     """
     hub, clock = service.hub, service.clock
     interface.check()
-    presence = Presence(DaemonEntry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
-    report, patience = _reporter(hub, clock), patience or Patience()
-    everything, stopping = presence.appear()
+    presence = DaemonInstance(DaemonEntry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
+    report, deadline = _make_reporter(hub, clock), deadline or ShutdownDeadline()
+    everything, stopping = presence.publish()
     doors = {"socket": everything, "stop": stopping}
     try:
-        doors.update(_tcp_doors(interface))
+        doors.update(_open_tcp_sockets(interface))
         bridge = Bridge(service)
         access = Access(interface.tokens, interface.hosts, interface.trusts_loopback)
-        stop = StopThread(bridge.stopping, access, lambda error: report(INTERFACE_FAILED, _failure(error)))
+        stop = StopThread(bridge.request_stop, access, lambda error: report(INTERFACE_FAILED, _describe_failure(error)))
     except BaseException:
         for door in doors.values():
             door.close()
-        presence.disappear()
+        presence.withdraw()
         raise
-    thread = _Thread(bridge, doors, presence, interface, access, stop, report=report)
+    thread = _ServerThread(bridge, doors, presence, interface, access, stop, report=report)
     try:
         for door in (*_UNIX, _TCP):
             if door in doors:
@@ -71,20 +71,20 @@ async def serve(
         presence.identify()
         with clock.hold():  # virtual time would be over before the first client is answered
             await asyncio.to_thread(thread.is_ready.wait, _READY_LIMIT_S)
-        spare_the_loaded()
+        freeze_loaded_objects()
         yield presence
     finally:
         bridge.close()
         with clock.hold():  # a client that does not read must not be where virtual time goes on
             for ending in (thread, stop):
-                await asyncio.to_thread(ending.end, patience.left_s(_CLOSE_LIMIT_S))
+                await asyncio.to_thread(ending.end, deadline.limit_s(_CLOSE_LIMIT_S))
         for door in doors.values():
             door.close()
-        presence.disappear()
+        presence.withdraw()
 
 
 @cache
-def spare_the_loaded() -> None:
+def freeze_loaded_objects() -> None:
     """Leave the 105,000 objects of the modules that are loaded by now out of every later search for garbage, once in a
     process: a search of them all keeps the guard, and a stop, waiting for 57 ms."""
     # Collection stays on: tracebacks of failed exchanges are cycles.
@@ -95,26 +95,26 @@ def preload() -> None:
     """Begin to import what serving needs, which takes half a second or more, before there is anybody to serve."""
 
     def load() -> None:
-        for name in ("app", "listening"):
+        for name in ("app", "http_clients"):
             importlib.import_module(f"thermostand.stand.serving.api.{name}")
 
     threading.Thread(target=load, name="interface-imports", daemon=True).start()
 
 
-def try_doors(interface: Interface) -> None:
+def check_ports(interface: Interface) -> None:
     """ConfigError when nobody can listen at one of its ports: a port in use is said before a device is opened."""
-    for door in _tcp_doors(interface).values():
+    for door in _open_tcp_sockets(interface).values():
         door.close()
 
 
-def _tcp_doors(interface: Interface) -> dict[str, socket.socket]:
+def _open_tcp_sockets(interface: Interface) -> dict[str, socket.socket]:
     """Listening at each of its ports, or at none of them."""
     doors: dict[str, socket.socket] = {}
     try:
         if interface.port is not None:
-            doors["tcp"] = _tcp("--port", interface.host, interface.port)
+            doors["tcp"] = _open_tcp_socket("--port", interface.host, interface.port)
         for each in interface.doors:
-            doors[each.option] = _tcp(each.option, each.host, each.port)
+            doors[each.option] = _open_tcp_socket(each.option, each.host, each.port)
     except ConfigError:
         for door in doors.values():
             door.close()
@@ -122,16 +122,16 @@ def _tcp_doors(interface: Interface) -> dict[str, socket.socket]:
     return doors
 
 
-def _tcp(option: str, host: str, port: int) -> socket.socket:
-    from thermostand.stand.serving.api.listening import listening_at
+def _open_tcp_socket(option: str, host: str, port: int) -> socket.socket:
+    from thermostand.stand.serving.api.http_clients import open_listening_socket
 
     try:
-        return listening_at(host, port)
+        return open_listening_socket(host, port)
     except OSError as error:
         raise ConfigError(f"{option} {port}: cannot listen at {host} ({error.strerror or error})") from error
 
 
-def _reporter(hub: Hub, clock: Clock) -> Callable[[EventKind, str], None]:
+def _make_reporter(hub: Hub, clock: Clock) -> Callable[[EventKind, str], None]:
     """A function for any thread: a warning of this kind, once for each text."""
     loop, reported = asyncio.get_running_loop(), set[str]()
 
@@ -144,12 +144,12 @@ def _reporter(hub: Hub, clock: Clock) -> Callable[[EventKind, str], None]:
     return report
 
 
-class _Thread:
+class _ServerThread:
     def __init__(
         self,
         bridge: Bridge,
         doors: dict[str, socket.socket],
-        presence: Presence,
+        presence: DaemonInstance,
         interface: Interface,
         access: Access,
         stop: StopThread,
@@ -185,7 +185,7 @@ class _Thread:
         try:
             asyncio.run(self._main())
         except Exception as error:  # noqa: BLE001 - the run goes on without it
-            self._report(NO_CONTROL, f"the run cannot be queried or paused: {failure_text(error)}")
+            self._report(NO_CONTROL, f"the run cannot be queried or paused: {describe_failure(error)}")
         finally:
             self.is_ready.set()
             for door, listening in self._doors.items():
@@ -195,11 +195,11 @@ class _Thread:
     async def _main(self) -> None:
         # Imported here: nothing else of the program needs them, and they take half a second.
         from thermostand.stand.serving.api.app import make_app
-        from thermostand.stand.serving.api.listening import Clients
+        from thermostand.stand.serving.api.http_clients import Clients
         from thermostand.stand.serving.api.stream import Stream
 
         stream = Stream(self._bridge)
-        app = make_app(self._bridge, stream, self._access, self._interface, self._failed)
+        app = make_app(self._bridge, stream, self._access, self._interface, self._report_failure)
         clients = Clients(app)
         self._stop.hand_over = clients.take
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
@@ -216,11 +216,11 @@ class _Thread:
             await asyncio.gather(*working, return_exceptions=True)
             await clients.close()
 
-    async def _serve(self, door: OtherDoor) -> None:
+    async def _serve(self, door: ProtocolListener) -> None:
         try:
-            await door.serve(self._doors[door.option], self._bridge, self._failed)
+            await door.serve(self._doors[door.option], self._bridge, self._report_failure)
         except Exception as error:  # noqa: BLE001 - the other doors stay open
-            self._report(NO_CONTROL, f"what {door.option} asked for is not served: {failure_text(error)}")
+            self._report(NO_CONTROL, f"what {door.option} asked for is not served: {describe_failure(error)}")
 
     async def _look_after(self, clients: Any) -> None:
         """A logout removes $XDG_RUNTIME_DIR with the sockets that are in it."""
@@ -232,15 +232,15 @@ class _Thread:
                 is_alone = True
                 for door in {"socket", "tcp"} & {*self._doors}:
                     await clients.accept_at(door, self._doors[door])
-            if not self._presence.is_there():
+            if not self._presence.is_published():
                 with suppress(SessionError, StandError):  # tried again the next time
-                    self._doors["socket"], self._doors["stop"] = self._presence.appear()
+                    self._doors["socket"], self._doors["stop"] = self._presence.publish()
                     for door in _UNIX:
                         self._stop.listen(door, self._doors[door])
 
-    def _failed(self, error: Exception) -> None:
-        self._report(INTERFACE_FAILED, _failure(error))
+    def _report_failure(self, error: Exception) -> None:
+        self._report(INTERFACE_FAILED, _describe_failure(error))
 
 
-def _failure(error: Exception) -> str:
-    return f"the interface has failed: {failure_text(error)}"
+def _describe_failure(error: Exception) -> str:
+    return f"the interface has failed: {describe_failure(error)}"

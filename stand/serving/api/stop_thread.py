@@ -30,14 +30,14 @@ from thermostand.stand.serving.api.access import (
     Access,
     Denied,
     Scope,
-    last_answer,
-    last_refusal,
-    uid_of,
+    get_peer_uid,
+    make_last_answer,
+    make_last_refusal,
 )
-from thermostand.stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, no_answer
-from thermostand.stand.serving.desk import Who
+from thermostand.stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, make_no_answer
+from thermostand.stand.serving.api_models import Who
 
-Door = Literal["stop", "socket", "tcp"]
+ListenerKind = Literal["stop", "socket", "tcp"]
 Stopping = Callable[[Who], "concurrent.futures.Future[BaseModel]"]
 
 # Chosen with `python -m tests.bench stop`: under a flood of connections STOP takes 227 to 412 ms, of silent ones
@@ -67,8 +67,8 @@ class _Client:
     """One connection: it has said nothing that is understood, or waits for `answer`, or `has_answer` and is listened to
     no more; until `until_s`."""
 
-    def __init__(self, door: Door, connection: socket.socket, now_s: float) -> None:
-        self.door: Door = door
+    def __init__(self, door: ListenerKind, connection: socket.socket, now_s: float) -> None:
+        self.door: ListenerKind = door
         self.connection = connection
         self.came_s = now_s
         self.until_s = now_s + _ASK_WITHIN_S
@@ -82,18 +82,21 @@ class _Client:
         has_time = not self.has_spoken and now_s < self.came_s + _MAY_SPEAK_S
         return self.has_answer or not (self.answer is not None or self.waits or has_time)
 
-    def scope(self, request: h11.Request) -> Scope:
+    def make_scope(self, request: h11.Request) -> Scope:
         """Its request, as the gatekeeper gets it."""
         is_local = self.connection.family == socket.AF_UNIX
-        there, here = (None, None) if is_local else (self.connection.getpeername(), self.connection.getsockname())
+        remote, here = (None, None) if is_local else (self.connection.getpeername(), self.connection.getsockname())
         return {
             "type": "http",
             "method": "POST",
             "path": STOP_PATH,
             "headers": list(request.headers),
-            "client": there,
+            "client": remote,
             "server": here,
-            "state": {"door": "socket" if is_local else "tcp", "uid": uid_of(self.connection) if is_local else None},
+            "state": {
+                "door": "socket" if is_local else "tcp",
+                "uid": get_peer_uid(self.connection) if is_local else None,
+            },
         }
 
 
@@ -103,14 +106,14 @@ class StopThread:
     happen."""
 
     def __init__(self, stopping: Stopping, access: Access, failed: Callable[[Exception], None]) -> None:
-        self.hand_over: Callable[[Door, socket.socket], bool] = lambda _door, _connection: False
+        self.hand_over: Callable[[ListenerKind, socket.socket], bool] = lambda _door, _connection: False
         self.has_failed = False
         self._spares: list[int] = []
         self._stopping = stopping
         self._access = access
         self._failed = failed
-        self._doors: dict[int, tuple[Door, socket.socket]] = {}
-        self._new: deque[tuple[Door, socket.socket]] = deque()
+        self._doors: dict[int, tuple[ListenerKind, socket.socket]] = {}
+        self._new: deque[tuple[ListenerKind, socket.socket]] = deque()
         self._clients: dict[int, _Client] = {}
         self._epoll = select.epoll()
         self._called = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -121,10 +124,10 @@ class StopThread:
         self._is_crowded = False
         self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
 
-    def listen(self, door: Door, listening: socket.socket) -> None:
+    def listen(self, door: ListenerKind, listening: socket.socket) -> None:
         """Accept at this socket from now on, which does not block, instead of the one of that door before."""
         self._new.append((door, listening))
-        self._call()
+        self._wake()
         if self.has_failed:
             listening.close()
 
@@ -135,10 +138,10 @@ class StopThread:
     def end(self, within_s: float) -> None:
         """Wait for it so long: answers that are due within a second are still given."""
         self._is_over.set()
-        self._call()
+        self._wake()
         self._thread.join(within_s)
 
-    def _call(self, _: object = None) -> None:
+    def _wake(self, _: object = None) -> None:
         with self._lock:
             if not self._has_ended:  # else its number may be that of another file
                 os.eventfd_write(self._called, 1)
@@ -146,10 +149,10 @@ class StopThread:
     def _run(self) -> None:
         try:
             while not self._is_over.is_set():
-                self._turn()
+                self._serve_ready()
                 if self._is_crowded:
                     self._is_over.wait(_REST_S)
-            self._leave()
+            self._shut_down()
         except Exception as error:  # noqa: BLE001 - the framework has a route for STOP, too
             self.has_failed = True
             self._failed(error)
@@ -166,20 +169,20 @@ class StopThread:
                 self._has_ended = True
                 os.close(self._called)
 
-    def _leave(self) -> None:
+    def _shut_down(self) -> None:
         for number in self._doors:
             self._epoll.unregister(number)
         until_s = time.monotonic() + _DRAIN_S
         while any(each.answer or each.has_answer for each in self._clients.values()) and time.monotonic() < until_s:
-            self._turn()
+            self._serve_ready()
 
-    def _turn(self) -> None:
+    def _serve_ready(self) -> None:
         """Everybody who has said something, then those who are new."""
         wait_s = _LOOK_S if self._clients else None
         events = self._epoll.poll(_REST_S if any(each.waits for each in self._clients.values()) else wait_s)
         for number, _ in events:
             if (client := self._clients.get(number)) is not None:
-                self._hear(client)
+                self._receive(client)
         self._is_crowded = False
         for number, _ in events:
             if (door := self._doors.get(number)) is not None:
@@ -188,9 +191,9 @@ class StopThread:
             os.eventfd_read(self._called)
         while self._new:
             self._open(*self._new.popleft())
-        self._look()
+        self._check_answers()
 
-    def _open(self, door: Door, listening: socket.socket) -> None:
+    def _open(self, door: ListenerKind, listening: socket.socket) -> None:
         for number, (name, before) in (*self._doors.items(),):
             if name == door:
                 del self._doors[number]
@@ -199,7 +202,7 @@ class StopThread:
         self._doors[listening.fileno()] = (door, listening)
         self._epoll.register(listening, select.EPOLLIN)
 
-    def _accept(self, door: Door, listening: socket.socket) -> None:
+    def _accept(self, door: ListenerKind, listening: socket.socket) -> None:
         if not self._has_room(door):
             self._is_crowded = True
             return
@@ -221,9 +224,9 @@ class StopThread:
             connection.setblocking(False)
             client = self._clients[connection.fileno()] = _Client(door, connection, time.monotonic())
             self._epoll.register(connection, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET)
-            self._hear(client)  # it has mostly said something by now
+            self._receive(client)  # it has mostly said something by now
 
-    def _has_room(self, door: Door) -> bool:
+    def _has_room(self, door: ListenerKind) -> bool:
         clients = [each for each in self._clients.values() if each.door == door and not each.waits]
         excess, now_s = len(clients) - _MOST_CLIENTS + 1, time.monotonic()
         if excess > 0:
@@ -239,7 +242,9 @@ class StopThread:
         silent = [each for each in self._clients.values() if each.answer is None or each.has_answer]
         if silent:
             with suppress(OSError):
-                silent[0].connection.send(last_refusal(503, "the daemon has no descriptor left, and you said nothing"))
+                silent[0].connection.send(
+                    make_last_refusal(503, "the daemon has no descriptor left, and you said nothing")
+                )
             self._drop(silent[0])
         elif self._spares:
             os.close(self._spares.pop())
@@ -250,52 +255,52 @@ class StopThread:
             while len(self._spares) < _SPARES:
                 self._spares.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
 
-    def _hear(self, client: _Client) -> None:
+    def _receive(self, client: _Client) -> None:
         try:
             if client.has_answer:
                 if not client.connection.recv(1 << 16):
                     self._drop(client)
             elif client.answer is None and not client.waits:
-                self._understand(client, client.connection.recv(_HEAD_BYTES, socket.MSG_PEEK))
+                self._parse(client, client.connection.recv(_HEAD_BYTES, socket.MSG_PEEK))
         except BlockingIOError:
             pass
         except OSError:
             self._drop(client)
         except Exception as error:  # noqa: BLE001 - after a client that fails, the next must be answered
             self._failed(error)
-            self._answer(client, last_refusal(500, FAILED.format(type(error).__name__)))
+            self._answer(client, make_last_refusal(500, FAILED.format(type(error).__name__)))
 
-    def _understand(self, client: _Client, said: bytes) -> None:
+    def _parse(self, client: _Client, text: bytes) -> None:
         client.has_spoken = True
-        if not said:
+        if not text:
             self._drop(client)
-        elif not (b"\n\r\n" in said or b"\n\n" in said or len(said) == _HEAD_BYTES):
+        elif not (b"\n\r\n" in text or b"\n\n" in text or len(text) == _HEAD_BYTES):
             return
-        elif said[: len(_REQUEST)] != _REQUEST:
-            self._hand_over(client, said)
+        elif text[: len(_REQUEST)] != _REQUEST:
+            self._hand_over(client, text)
         else:
             parser = h11.Connection(h11.SERVER, max_incomplete_event_size=_HEAD_BYTES - 1)
-            parser.receive_data(said)
+            parser.receive_data(text)
             try:
                 request = parser.next_event()
             except h11.RemoteProtocolError:
-                self._hand_over(client, said)
+                self._hand_over(client, text)
                 return
             if isinstance(request, h11.Request):
                 if request.target.partition(b"?")[0] == STOP_PATH.encode():
                     self._stop(client, request)
                 else:
-                    self._hand_over(client, said)
+                    self._hand_over(client, text)
 
-    def _hand_over(self, client: _Client, said: bytes) -> None:
+    def _hand_over(self, client: _Client, text: bytes) -> None:
         most = _MOST_WAITING[client.door]
         if client.door == "stop":
-            self._answer(client, last_refusal(404, "here is nothing but STOP"))
-        elif _CHUNKED.search(said.partition(b"\n\r\n")[0]):
+            self._answer(client, make_last_refusal(404, "here is nothing but STOP"))
+        elif _CHUNKED.search(text.partition(b"\n\r\n")[0]):
             # A megabyte of them, of one byte each, would keep a thread for half a minute.
-            self._answer(client, last_refusal(411, CHUNKS))
+            self._answer(client, make_last_refusal(411, CHUNKS))
         elif sum(each.waits and each.door == client.door for each in self._clients.values()) >= most:
-            self._answer(client, last_refusal(503, f"{most} clients wait already to be let in"))
+            self._answer(client, make_last_refusal(503, f"{most} clients wait already to be let in"))
         else:
             client.waits = True
             self._let_in(client)
@@ -309,22 +314,22 @@ class StopThread:
 
     def _stop(self, client: _Client, request: h11.Request) -> None:
         try:
-            who = self._access.admit(client.scope(request))
+            who = self._access.admit(client.make_scope(request))
         except Denied as denied:
-            self._answer(client, last_refusal(denied.status, str(denied)))
+            self._answer(client, make_last_refusal(denied.status, str(denied)))
             return
         client.until_s = time.monotonic() + COMMAND_LIMIT_S
         client.answer = self._stopping(who)
-        client.answer.add_done_callback(self._call)
+        client.answer.add_done_callback(self._wake)
 
-    def _look(self) -> None:
+    def _check_answers(self) -> None:
         """Answers that have come, and what takes too long."""
         now_s = time.monotonic()
         for client in (*self._clients.values(),):
             if client.answer is not None and client.answer.done():
-                self._answer(client, _given(client.answer))
+                self._answer(client, _make_answer(client.answer))
             elif client.answer is not None and now_s > client.until_s:
-                self._answer(client, last_refusal(504, str(no_answer(COMMAND_LIMIT_S))))
+                self._answer(client, make_last_refusal(504, str(make_no_answer(COMMAND_LIMIT_S))))
             elif now_s > client.until_s:
                 self._drop(client)
             elif client.waits:
@@ -349,10 +354,10 @@ class StopThread:
         client.connection.close()
 
 
-def _given(answer: concurrent.futures.Future[BaseModel]) -> bytes:
+def _make_answer(answer: concurrent.futures.Future[BaseModel]) -> bytes:
     error = answer.exception()
     if error is None:
-        return last_answer(200, answer.result().model_dump_json().encode())
+        return make_last_answer(200, answer.result().model_dump_json().encode())
     if isinstance(error, NoAnswer):
-        return last_refusal(504, str(error))
-    return last_refusal(500, FAILED.format(type(error).__name__))
+        return make_last_refusal(504, str(error))
+    return make_last_refusal(500, FAILED.format(type(error).__name__))

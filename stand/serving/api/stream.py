@@ -20,7 +20,7 @@ from pydantic_core import to_json
 from thermostand.foundation.items import Batch, Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame, Quality, Reading
 from thermostand.stand.serving.api.bridge import Bridge, StateSnapshot
-from thermostand.stand.serving.desk import StandState
+from thermostand.stand.serving.api_models import StandState
 
 EVENTS = 5_000  # kept for those who reconnect: days
 READINGS = 3_000  # batches: some minutes; the page's history has the rest
@@ -51,35 +51,35 @@ class StreamMessage:
         return f'{{"seq":{self.seq},{self.data[1:]}'
 
 
-def json_of(value: object) -> str:
+def make_json(value: object) -> str:
     """JSON of any value, NaN and infinities as null."""
-    return to_json(value, inf_nan_mode="null", fallback=_plain).decode()
+    return to_json(value, inf_nan_mode="null", fallback=_make_plain).decode()
 
 
-def _plain(value: object) -> object:
+def _make_plain(value: object) -> object:
     return dict(value) if isinstance(value, Mapping) else str(value)  # pyright: ignore[reportUnknownVariableType]
 
 
-def message_of(seq: int, utc_offset_ns: int, item: Item) -> StreamMessage:
+def make_message(seq: int, utc_offset_ns: int, item: Item) -> StreamMessage:
     """An item as the stream gives it: a step of the plan that began or ended is an event of kind `step`."""
     stamp = {"time_ns": item.time_ns, "utc_offset_ns": utc_offset_ns}
     match item:
         case Event(_, level, kind, text, data):
             fields = {**stamp, "level": level, "kind": kind, "text": text, "data": dict(data)}
-            return StreamMessage(seq, "event", json_of(fields))
+            return StreamMessage(seq, "event", make_json(fields))
         case StepMark(_, step_id, index, kind, state, parameters):
             data = {"step_id": step_id, "index": index, "step": kind, "state": state, "parameters": parameters}
             text = f"step {index + 1} ({kind}) {state}"
             fields = {**stamp, "level": "info", "kind": "step", "text": text, "data": data}
-            return StreamMessage(seq, "event", json_of(fields))
+            return StreamMessage(seq, "event", make_json(fields))
         case Batch(device, _, readings):
-            values = {reading.channel: reading_of(reading) for reading in readings}
-            return StreamMessage(seq, "reading", json_of({**stamp, "device": device, "readings": values}))
+            values = {reading.channel: make_reading(reading) for reading in readings}
+            return StreamMessage(seq, "reading", make_json({**stamp, "device": device, "readings": values}))
         case Frame() | Original():
             raise ValueError("images are no items of the stream")
 
 
-def reading_of(reading: Reading) -> dict[str, object]:
+def make_reading(reading: Reading) -> dict[str, object]:
     """The fields of desk.ReadingState."""
     value = None if reading.quality is Quality.BAD else reading.value
     return {
@@ -130,7 +130,7 @@ class Viewer:
         self._since_state += 1
         if self._lost is not None:
             (first, last), self._lost = self._lost, None
-            return StreamMessage(last, "gone", json_of({"first": first, "last": last, "drops": self.drops})).json()
+            return StreamMessage(last, "gone", make_json({"first": first, "last": last, "drops": self.drops})).json()
         return self._waiting.popleft().json()
 
 
@@ -163,13 +163,13 @@ class Stream:
         for seq, utc_offset_ns, item in self._bridge.take():
             self.drops += seq - self._seq - 1
             self._seq = seq
-            message = message_of(seq, utc_offset_ns, item)
+            message = make_message(seq, utc_offset_ns, item)
             self._keep(message)
             for viewer in self._viewers:
                 viewer.give(message)
         snapshot = self._bridge.snapshot
         if snapshot is not self._reported and self._viewers:
-            self._reported, text = snapshot, state_json(snapshot, self.drops)
+            self._reported, text = snapshot, make_state_json(snapshot, self.drops)
             for viewer in self._viewers:
                 viewer.tell(text)
 
@@ -178,7 +178,7 @@ class Stream:
         self.pump()
         missing = None if after is None else self.missing(after)
         viewer = Viewer(() if after is None else (*((missing,) if missing else ()), *self.after(after)))
-        viewer.tell(state_json(self._bridge.snapshot, self.drops))
+        viewer.tell(make_state_json(self._bridge.snapshot, self.drops))
         self._viewers.add(viewer)
         return viewer
 
@@ -198,10 +198,10 @@ class Stream:
             first, last = self._first + 1, self._first
         elif last < first:
             return None
-        gone = {"first": first, "last": last, "types": self.missing_types(after), "drops": self.drops}
-        return StreamMessage(last, "gone", json_of(gone))
+        gone = {"first": first, "last": last, "types": self.list_missing_types(after), "drops": self.drops}
+        return StreamMessage(last, "gone", make_json(gone))
 
-    def missing_types(self, after: int) -> list[Kind]:
+    def list_missing_types(self, after: int) -> list[Kind]:
         """Of which types some are gone for a viewer that has seen all up to `after`."""
         is_other = after > self._seq  # of another stream
         gone: tuple[tuple[Kind, int], ...] = (("event", self._gone_events), ("reading", self._gone_readings))
@@ -224,7 +224,7 @@ class Stream:
             self._readings.append(message)
 
 
-def state_json(snapshot: StateSnapshot, drops: int) -> str:
+def make_state_json(snapshot: StateSnapshot, drops: int) -> str:
     """The message of a state."""
     state: StandState = snapshot.state.model_copy(update={"drops": drops})
     return f'{{"seq":{state.seq},"type":"state","data":{state.model_dump_json()}}}'

@@ -6,7 +6,7 @@ import { bytes, css, dated_clock, duration, fill, h, hold_resumes, seconds } fro
 import uPlot from "./uPlot.js";
 
 const MOST_ROWS = 200;
-const RESUMABLE = ["interrupted", "stopped", "tripped", "failed"]; // recording/reading/run_word.py
+const RESUMABLE = ["interrupted", "stopped", "tripped", "failed"]; // recording/reading/run_status.py
 // A dash says which night: here colours alone tell air from camera, and must be far apart.
 const COMPARED = [["thermometers.air", "--c-granite"], ["camera.temperature", "--c-camera"]];
 

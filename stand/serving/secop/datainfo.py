@@ -50,20 +50,20 @@ def command(argument: DataInfo | None = None, result: DataInfo | None = None) ->
     return {"type": "command", **{name: dict(info) for name, info in given.items() if info is not None}}
 
 
-def taken(info: DataInfo, value: JsonValue) -> JsonValue:
+def check_value(info: DataInfo, value: JsonValue) -> JsonValue:
     """The value, when it is of that type; Refusal WrongType or RangeError. An enum takes its names, too."""
     match info["type"]:
         case "double" | "int":
-            return _number(info, value)
+            return _check_number(info, value)
         case "string":
-            return _string(value)
+            return _check_string(value)
         case "enum":
-            return _member(info, value)
+            return _check_member(info, value)
         case kind:
             raise Refusal("WrongType", f"a {kind} is not taken")
 
 
-def _number(info: DataInfo, value: JsonValue) -> float:
+def _check_number(info: DataInfo, value: JsonValue) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise Refusal("WrongType", "a number is needed")
     try:
@@ -80,7 +80,7 @@ def _number(info: DataInfo, value: JsonValue) -> float:
     return int(number) if info["type"] == "int" else number
 
 
-def _string(value: JsonValue) -> str:
+def _check_string(value: JsonValue) -> str:
     if not isinstance(value, str):
         raise Refusal("WrongType", "a string is needed")
     if len(value) > TEXT_LIMIT:
@@ -88,7 +88,7 @@ def _string(value: JsonValue) -> str:
     return value
 
 
-def _member(info: DataInfo, value: JsonValue) -> int:
+def _check_member(info: DataInfo, value: JsonValue) -> int:
     members = info["members"]
     if not isinstance(members, dict):
         raise TypeError("an enum has members")

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pydantic import JsonValue
 
 from thermostand.stand.estimating.chamber_model import BAND_K
+from thermostand.stand.serving.api_models import DeviceState, ReadingState, RunStatus, StandState
 from thermostand.stand.serving.commands import STOP
 from thermostand.stand.serving.commands import Command as Ordered
-from thermostand.stand.serving.desk import DeviceState, ReadingState, RunStatus, StandState
 from thermostand.stand.serving.secop import datainfo
 from thermostand.stand.serving.secop.modules import (
     BUSY,
@@ -19,16 +19,16 @@ from thermostand.stand.serving.secop.modules import (
     RAMPING,
     SENSOR_CODES,
     WARN,
-    KnownValue,
     Module,
     ModuleCommand,
     ModuleView,
     Parameter,
     ServiceOrder,
-    by_hand,
-    driven,
-    measured,
-    status,
+    TimedValue,
+    get_drive_status,
+    get_sensor_status,
+    make_device_order,
+    make_status_parameter,
 )
 from thermostand.stand.serving.secop.secop_lines import Refusal
 
@@ -43,57 +43,59 @@ _CLOSED, _OPEN, _MOVING = 0, 1, 2
 _PHASES = {"idle": 0, "running": 1, "held": 2, "stopping": 3}
 
 
-def modules(
+def make_modules(
     devices: Iterable[DeviceState], readings: Mapping[str, ReadingState], commands: Mapping[str, Ordered]
 ) -> dict[str, Module]:
     """By name, in the order in which clients show them: the channel's with an underscore for a temperature."""
     found: dict[str, Module] = {}
-    for name, module in (*_of(devices, readings), (RUN, _run(commands))):
+    for name, module in (*_iterate_modules(devices, readings), (RUN, _make_run(commands))):
         while name in found:  # such as an axis that is called chamber
             name += "_"
         found[name] = module
     return found
 
 
-def _of(devices: Iterable[DeviceState], readings: Mapping[str, ReadingState]) -> Iterator[tuple[str, Module]]:
+def _iterate_modules(
+    devices: Iterable[DeviceState], readings: Mapping[str, ReadingState]
+) -> Iterator[tuple[str, Module]]:
     for device in devices:
         match device.kind:
             case "regulator":
-                yield CHAMBER, _chamber(device)
+                yield CHAMBER, _make_chamber(device)
             case "flap":
-                yield device.name, _flap(device)
+                yield device.name, _make_flap(device)
             case "axis":
-                yield device.name, _axis(device, readings)
+                yield device.name, _make_axis(device, readings)
             case "thermometers" | "camera":
                 for channel in device.channels:
                     if readings[channel].unit == "degC":
-                        yield channel.replace(".", "_"), _thermometer(device, channel)
+                        yield channel.replace(".", "_"), _make_thermometer(device, channel)
             case _:
                 pass
 
 
-def _thermometer(device: DeviceState, channel: str) -> Module:
+def _make_thermometer(device: DeviceState, channel: str) -> Module:
     return Module(
         f"temperature {channel}",
         "Readable",
         device.name,
         {
             "value": Parameter("the temperature", datainfo.double("degC"), lambda seen: seen.number(channel)),
-            "status": status(SENSOR_CODES, lambda seen: measured(seen, channel)),
+            "status": make_status_parameter(SENSOR_CODES, lambda seen: get_sensor_status(seen, channel)),
         },
     )
 
 
-def _chamber(device: DeviceState) -> Module:
+def _make_chamber(device: DeviceState) -> Module:
     name, pv, sp = device.name, f"{device.name}.pv", f"{device.name}.sp"
-    low, high = _range(device, "set")
+    low, high = _get_range(device, "set")
 
     def read_ns(state: StandState) -> int:
         reading = state.readings.get(sp)
         return -1 if reading is None else reading.time_ns
 
     def read_status(seen: ModuleView) -> tuple[int, str]:
-        code, sentence = driven(seen, pv, read_ns(seen.state))
+        code, sentence = get_drive_status(seen, pv, read_ns(seen.state))
         target = seen.state.setpoint_degC
         if code not in (IDLE, WARN):
             return code, sentence
@@ -103,43 +105,43 @@ def _chamber(device: DeviceState) -> Module:
             return RAMPING, f"on the way to {target:g} degC"
         return code, sentence or f"at {target:g} degC"
 
-    def read_target(seen: ModuleView) -> KnownValue:
-        return seen.number(sp) if seen.drive.ordered is None else KnownValue(seen.drive.ordered)
+    def read_target(seen: ModuleView) -> TimedValue:
+        return seen.number(sp) if seen.drive.ordered is None else TimedValue(seen.drive.ordered)
 
     def change(value: JsonValue) -> ServiceOrder:
-        return by_hand(name, "set", setpoint_degC=value)
+        return make_device_order(name, "set", setpoint_degC=value)
 
     parameters = {
         "value": Parameter("the air, as the regulator reads it", datainfo.double("degC"), lambda s: s.number(pv)),
-        "status": status(DRIVE_CODES, read_status),
+        "status": make_status_parameter(DRIVE_CODES, read_status),
         "target": Parameter("the set-point", datainfo.double("degC", low, high), read_target, change),
         "control_active": Parameter(
-            "whether it heats or cools", datainfo.boolean(), lambda s: KnownValue(s.state.setpoint_degC is not None)
+            "whether it heats or cools", datainfo.boolean(), lambda s: TimedValue(s.state.setpoint_degC is not None)
         ),
         "_tolerance": Parameter(
-            "so close to the target it is IDLE", datainfo.double("K"), lambda _: KnownValue(BAND_K, 0)
+            "so close to the target it is IDLE", datainfo.double("K"), lambda _: TimedValue(BAND_K, 0)
         ),
-        "_output": Parameter("heat; below zero cold", datainfo.double("%"), _output),
+        "_output": Parameter("heat; below zero cold", datainfo.double("%"), _read_output),
         "_heat_permitted": Parameter(
-            "whether heat is permitted", datainfo.boolean(), lambda s: KnownValue(s.state.heater_permitted)
+            "whether heat is permitted", datainfo.boolean(), lambda s: TimedValue(s.state.heater_permitted)
         ),
         "_compressor_on": Parameter(
-            "whether the compressor's relay is on", datainfo.boolean(), lambda s: KnownValue(s.state.compressor_on)
+            "whether the compressor's relay is on", datainfo.boolean(), lambda s: TimedValue(s.state.compressor_on)
         ),
     }
     stop = ModuleCommand(
-        "stop heating and cooling; the air drifts to the laboratory's", lambda _: by_hand(name, "stop")
+        "stop heating and cooling; the air drifts to the laboratory's", lambda _: make_device_order(name, "stop")
     )
     return Module("the chamber's temperature", "Drivable", CHAMBER, parameters, {"stop": stop}, name, read_ns)
 
 
-def _output(seen: ModuleView) -> KnownValue:
+def _read_output(seen: ModuleView) -> TimedValue:
     if seen.state.output_percent is None:
         raise Refusal("ReadFailed", "the regulator's output is not known")
-    return KnownValue(seen.state.output_percent)
+    return TimedValue(seen.state.output_percent)
 
 
-def _flap(device: DeviceState) -> Module:
+def _make_flap(device: DeviceState) -> Module:
     name, channel = device.name, f"{device.name}.position"
     places = {"closed": _CLOSED, "open": _OPEN}
 
@@ -147,27 +149,27 @@ def _flap(device: DeviceState) -> Module:
         return {**places, "moving": _MOVING}.get(seen.state.flap, _MOVING)
 
     def read_status(seen: ModuleView) -> tuple[int, str]:
-        return (BUSY, "under way") if read(seen) == _MOVING else driven(seen, channel, seen.state.now_ns)
+        return (BUSY, "under way") if read(seen) == _MOVING else get_drive_status(seen, channel, seen.state.now_ns)
 
-    def read_target(seen: ModuleView) -> KnownValue:
+    def read_target(seen: ModuleView) -> TimedValue:
         ordered = seen.drive.ordered
-        return KnownValue(ordered if ordered is not None else min(read(seen), _OPEN))
+        return TimedValue(ordered if ordered is not None else min(read(seen), _OPEN))
 
     def change(value: JsonValue) -> ServiceOrder:
-        return by_hand(name, "open" if value == _OPEN else "close")
+        return make_device_order(name, "open" if value == _OPEN else "close")
 
     parameters = {
         "value": Parameter(
-            "where it is", datainfo.choice({**places, "moving": _MOVING}), lambda seen: KnownValue(read(seen))
+            "where it is", datainfo.choice({**places, "moving": _MOVING}), lambda seen: TimedValue(read(seen))
         ),
-        "status": status(DRIVE_CODES, read_status),
+        "status": make_status_parameter(DRIVE_CODES, read_status),
         "target": Parameter("where it is to be", datainfo.choice(places), read_target, change),
     }
     stop = ModuleCommand("nothing: a flap is not left half open, its move of seconds is completed", None)
     return Module("the flap between chamber and camera", "Drivable", name, parameters, {"stop": stop}, name)
 
 
-def _axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
+def _make_axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
     name, channel = device.name, f"{device.name}.position"
     reading = readings.get(channel)
     info = datainfo.double("" if reading is None else reading.unit)
@@ -177,35 +179,35 @@ def _axis(device: DeviceState, readings: Mapping[str, ReadingState]) -> Module:
         return -1 if reading is None else reading.time_ns
 
     def read_status(seen: ModuleView) -> tuple[int, str]:
-        return driven(seen, channel, read_ns(seen.state))
+        return get_drive_status(seen, channel, read_ns(seen.state))
 
-    def read_target(seen: ModuleView) -> KnownValue:
-        return seen.number(channel) if seen.drive.ordered is None else KnownValue(seen.drive.ordered)
+    def read_target(seen: ModuleView) -> TimedValue:
+        return seen.number(channel) if seen.drive.ordered is None else TimedValue(seen.drive.ordered)
 
     def change(value: JsonValue) -> ServiceOrder:
-        return by_hand(name, "move", position=value)
+        return make_device_order(name, "move", position=value)
 
     parameters = {
         "value": Parameter("where it is", info, lambda seen: seen.number(channel)),
-        "status": status(DRIVE_CODES, read_status),
-        "target": Parameter("where it is to be", {**info, **_limits(device, "move")}, read_target, change),
+        "status": make_status_parameter(DRIVE_CODES, read_status),
+        "target": Parameter("where it is to be", {**info, **_get_limits(device, "move")}, read_target, change),
     }
     commands = {
-        "stop": ModuleCommand("stop where it is", lambda _: by_hand(name, "stop")),
-        "_home": ModuleCommand("find the home switch", lambda _: by_hand(name, "home")),
+        "stop": ModuleCommand("stop where it is", lambda _: make_device_order(name, "stop")),
+        "_home": ModuleCommand("find the home switch", lambda _: make_device_order(name, "home")),
     }
     return Module(f"the stage {name}", "Drivable", "stages", parameters, commands, name, read_ns, is_read_after=True)
 
 
-def _run(commands: Mapping[str, Ordered]) -> Module:
+def _make_run(commands: Mapping[str, Ordered]) -> Module:
     def parameter(text: str, info: datainfo.DataInfo, read: Callable[[RunStatus], JsonValue], none: JsonValue):
-        return Parameter(text, info, lambda s: KnownValue(none if s.state.run is None else read(s.state.run)))
+        return Parameter(text, info, lambda s: TimedValue(none if s.state.run is None else read(s.state.run)))
 
     parameters = {
         "value": Parameter(
-            "the phase of the stand", datainfo.choice(_PHASES), lambda s: KnownValue(_PHASES[s.state.phase])
+            "the phase of the stand", datainfo.choice(_PHASES), lambda s: TimedValue(_PHASES[s.state.phase])
         ),
-        "status": status(DRIVE_CODES, _run_status),
+        "status": make_status_parameter(DRIVE_CODES, _get_run_status),
         "_recipe": parameter("what is run", datainfo.text(), lambda run: run.recipe, ""),
         "_session": parameter("the name of its session", datainfo.text(), lambda run: run.run_id, ""),
         "_doing": parameter("the step under way", datainfo.text(), lambda run: run.doing, ""),
@@ -216,20 +218,22 @@ def _run(commands: Mapping[str, Ordered]) -> Module:
         "_prompt": Parameter(
             "what an operator is asked for",
             datainfo.text(),
-            lambda s: KnownValue(s.state.prompt.text if s.state.prompt else ""),
+            lambda s: TimedValue(s.state.prompt.text if s.state.prompt else ""),
         ),
-        "_held_by": Parameter("what holds it", datainfo.text(), lambda s: KnownValue(", ".join(s.state.reasons))),
+        "_held_by": Parameter("what holds it", datainfo.text(), lambda s: TimedValue(", ".join(s.state.reasons))),
         "_fault": Parameter(
             "what has tripped",
             datainfo.text(),
-            lambda s: KnownValue("" if s.state.fault is None else s.state.fault.text),
+            lambda s: TimedValue("" if s.state.fault is None else s.state.fault.text),
         ),
     }
-    ordered = {_NAMES.get(name, f"_{name}"): _command(each) for name, each in commands.items() if _is_offered(each)}
+    ordered = {
+        _NAMES.get(name, f"_{name}"): _make_command(each) for name, each in commands.items() if _is_offered(each)
+    }
     return Module("runs, and the stand as a whole", "Readable", RUN, parameters, ordered)
 
 
-def _run_status(seen: ModuleView) -> tuple[int, str]:
+def _get_run_status(seen: ModuleView) -> tuple[int, str]:
     state = seen.state
     if state.fault is not None:
         return ERROR, state.fault.text
@@ -243,30 +247,30 @@ def _run_status(seen: ModuleView) -> tuple[int, str]:
 
 def _is_offered(command: Ordered) -> bool:
     field = command.secop_field
-    return field is not None and (not field or _type_of(command, field) in _INFOS)
+    return field is not None and (not field or _get_field_type(command, field) in _INFOS)
 
 
-def _type_of(command: Ordered, field: str) -> object:
+def _get_field_type(command: Ordered, field: str) -> object:
     return None if command.argument is None else command.argument.model_fields[field].annotation
 
 
-def _command(command: Ordered) -> ModuleCommand:
+def _make_command(command: Ordered) -> ModuleCommand:
     """A command of the stand's service, with at most one field of its argument; what it queues has a number."""
     field = command.secop_field
 
     def order(value: JsonValue) -> ServiceOrder:
         return ServiceOrder(command.name, {field: value} if field else {})
 
-    argument = _INFOS[_type_of(command, field)]() if field else None
+    argument = _INFOS[_get_field_type(command, field)]() if field else None
     result = datainfo.whole() if "id" in command.answer.model_fields else None
     return ModuleCommand(command.summary, order, argument, result, is_stop=command.name == STOP)
 
 
-def _range(device: DeviceState, verb: str) -> tuple[float | None, float | None]:
+def _get_range(device: DeviceState, verb: str) -> tuple[float | None, float | None]:
     arguments = [each.arguments[0] for each in device.verbs if each.verb == verb and each.arguments]
     return (arguments[0].minimum, arguments[0].maximum) if arguments else (None, None)
 
 
-def _limits(device: DeviceState, verb: str) -> dict[str, JsonValue]:
-    low, high = _range(device, verb)
+def _get_limits(device: DeviceState, verb: str) -> dict[str, JsonValue]:
+    low, high = _get_range(device, verb)
     return {} if low is None or high is None else {"min": low, "max": high}

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from pydantic import JsonValue
 
-from thermostand.stand.serving.desk import ReadingState, StandState
+from thermostand.stand.serving.api_models import ReadingState, StandState
 from thermostand.stand.serving.secop import datainfo
 from thermostand.stand.serving.secop.datainfo import DataInfo
 from thermostand.stand.serving.secop.secop_lines import Refusal
@@ -22,14 +22,14 @@ InterfaceClass = Literal["Readable", "Writable", "Drivable"]
 
 
 @dataclass(frozen=True, slots=True)
-class KnownValue:
+class TimedValue:
     """A value. time_ns: when it was obtained, on the stand's clock; None: as long as the state says so."""
 
     value: JsonValue
     time_ns: int | None = None
 
 
-Report = KnownValue | Refusal
+Report = TimedValue | Refusal
 
 
 class Drive:
@@ -73,13 +73,13 @@ class ModuleView:
             raise Refusal("ReadFailed", f"{channel} has not been read")
         return found
 
-    def number(self, channel: str) -> KnownValue:
+    def number(self, channel: str) -> TimedValue:
         """The value of a channel; Refusal when it is BAD: never an old one."""
         reading = self.reading(channel)
         if reading.value is None:
             kind = "CommunicationFailed" if reading.cause == "wire" else "HardwareError"
             raise Refusal(kind, reading.reason or "this is no measurement")
-        return KnownValue(reading.value, reading.time_ns)
+        return TimedValue(reading.value, reading.time_ns)
 
 
 class ServiceOrder(NamedTuple):
@@ -96,17 +96,17 @@ class Parameter:
 
     text: str
     info: DataInfo
-    read: Callable[[ModuleView], KnownValue]
+    read: Callable[[ModuleView], TimedValue]
     change: Callable[[JsonValue], ServiceOrder] | None = None
 
-    def report(self, seen: ModuleView) -> Report:
+    def make_report(self, seen: ModuleView) -> Report:
         """What is read now."""
         try:
             return self.read(seen)
         except Refusal as refusal:
             return refusal
 
-    def described(self) -> dict[str, object]:
+    def describe(self) -> dict[str, object]:
         """For the node's description."""
         return {"description": self.text, "datainfo": self.info, "readonly": self.change is None}
 
@@ -121,7 +121,7 @@ class ModuleCommand:
     result: DataInfo | None = None
     is_stop: bool = False
 
-    def described(self) -> dict[str, object]:
+    def describe(self) -> dict[str, object]:
         """For the node's description."""
         return {"description": self.text, "datainfo": datainfo.command(self.argument, self.result)}
 
@@ -140,11 +140,11 @@ class Module:
     read_ns: Callable[[StandState], int] = lambda state: state.now_ns
     is_read_after: bool = False
 
-    def looked_at(self) -> Module:
+    def make_read_only(self) -> Module:
         """The same, of which nothing can be changed."""
         return replace(self, parameters={name: replace(each, change=None) for name, each in self.parameters.items()})
 
-    def described(self) -> dict[str, object]:
+    def describe(self) -> dict[str, object]:
         """For the node's description."""
         return {
             "description": self.text,
@@ -152,22 +152,22 @@ class Module:
             "features": [],
             "group": self.group,
             "accessibles": {
-                name: accessible.described() for name, accessible in (*self.parameters.items(), *self.commands.items())
+                name: accessible.describe() for name, accessible in (*self.parameters.items(), *self.commands.items())
             },
         }
 
 
-def status(codes: Mapping[str, int], read: Callable[[ModuleView], tuple[int, str]]) -> Parameter:
+def make_status_parameter(codes: Mapping[str, int], read: Callable[[ModuleView], tuple[int, str]]) -> Parameter:
     """The parameter of that name."""
 
-    def reported(seen: ModuleView) -> KnownValue:
+    def reported(seen: ModuleView) -> TimedValue:
         code, sentence = read(seen)
-        return KnownValue([code, sentence])
+        return TimedValue([code, sentence])
 
     return Parameter("what it does, and why", datainfo.status(codes), reported)
 
 
-def measured(seen: ModuleView, channel: str) -> tuple[int, str]:
+def get_sensor_status(seen: ModuleView, channel: str) -> tuple[int, str]:
     """The status of what is read from one channel."""
     reading = seen.state.readings.get(channel)
     if reading is None or reading.value is None:
@@ -175,9 +175,9 @@ def measured(seen: ModuleView, channel: str) -> tuple[int, str]:
     return (WARN, reading.reason) if reading.quality != "good" else (IDLE, "")
 
 
-def driven(seen: ModuleView, channel: str, read_ns: int) -> tuple[int, str]:
+def get_drive_status(seen: ModuleView, channel: str, read_ns: int) -> tuple[int, str]:
     """The status of what moves, but for what only the device itself knows."""
-    code, sentence = measured(seen, channel)
+    code, sentence = get_sensor_status(seen, channel)
     state = seen.state
     if code == ERROR:
         return code, sentence
@@ -192,6 +192,6 @@ def driven(seen: ModuleView, channel: str, read_ns: int) -> tuple[int, str]:
     return code, sentence
 
 
-def by_hand(device: str, verb: str, **arguments: JsonValue) -> ServiceOrder:
+def make_device_order(device: str, verb: str, **arguments: JsonValue) -> ServiceOrder:
     """An order to a device, through the gate of all that is done by hand."""
     return ServiceOrder("device", {"device": device, "verb": verb, "arguments": arguments})

@@ -23,17 +23,17 @@ from thermostand.foundation.errors import (
     Unreachable,
 )
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, StateSnapshot
-from thermostand.stand.serving.desk import Conflict, DeviceState, QueuedRun, StandState, Who
-from thermostand.stand.serving.secop.datainfo import taken
-from thermostand.stand.serving.secop.devices import modules
+from thermostand.stand.serving.api_models import Conflict, DeviceState, QueuedRun, StandState, Who
+from thermostand.stand.serving.secop.datainfo import check_value
+from thermostand.stand.serving.secop.devices import make_modules
 from thermostand.stand.serving.secop.modules import (
     Drive,
-    KnownValue,
     Module,
     ModuleCommand,
     ModuleView,
     Report,
     ServiceOrder,
+    TimedValue,
 )
 from thermostand.stand.serving.secop.secop_lines import (
     ANSWERS,
@@ -42,8 +42,8 @@ from thermostand.stand.serving.secop.secop_lines import (
     ErrorClass,
     Refusal,
     SecopRequest,
-    message,
-    report,
+    make_message,
+    make_report,
 )
 
 WHO = Who(name="", how="secop")
@@ -54,7 +54,7 @@ _HELP = (
     "do module:command [argument], ping id; `do run:stop` makes the stand safe"
 )
 
-Place = tuple[str, str]
+ParameterPath = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,20 +73,22 @@ class Node:
         self,
         bridge: Bridge,
         devices: Iterable[DeviceState],
-        tell: Callable[[Place, bytes], None],
+        tell: Callable[[ParameterPath, bytes], None],
         failed: Callable[[Exception], None],
         *,
         read_only: bool = False,
     ) -> None:
         state = bridge.snapshot.state
-        found = modules(devices, state.readings, bridge.commands)
-        self.modules: dict[str, Module] = {n: each.looked_at() for n, each in found.items()} if read_only else found
+        found = make_modules(devices, state.readings, bridge.commands)
+        self.modules: dict[str, Module] = (
+            {n: each.make_read_only() for n, each in found.items()} if read_only else found
+        )
         self._read_only = read_only
-        self.description = message("describing", ".", _description(state, self.modules))
+        self.description = make_message("describing", ".", _make_description(state, self.modules))
         self._bridge = bridge
         self._tell, self._failed = tell, failed
         self._drives = {name: Drive() for name in self.modules}
-        self._reported: dict[Place, _Reported] = {}
+        self._reported: dict[ParameterPath, _Reported] = {}
         self.look()
 
     def look(self) -> None:
@@ -97,15 +99,15 @@ class Node:
             self._drives[name].look(is_busy, snapshot.state.now_ns, module.read_ns(snapshot.state))
             for parameter in module.parameters:
                 if self._has_changed(snapshot, name, parameter):
-                    self._tell((name, parameter), self.update((name, parameter)))
+                    self._tell((name, parameter), self.make_update((name, parameter)))
 
-    def places(self, module: str = "") -> list[Place]:
+    def list_parameters(self, module: str = "") -> list[ParameterPath]:
         """Every parameter, of one module or of all."""
         return [place for place in self._reported if module in ("", place[0])]
 
-    def update(self, place: Place) -> bytes:
+    def make_update(self, place: ParameterPath) -> bytes:
         """The line that tells a parameter's value, or why there is none."""
-        return self._line("update", "error_update", place)
+        return self._make_line("update", "error_update", place)
 
     def is_stop(self, request: SecopRequest) -> bool:
         """Whether this is STOP, which nothing may delay."""
@@ -119,9 +121,9 @@ class Node:
             await self._bridge.stop(WHO)
         except NoAnswer as error:
             raise Refusal("TimeoutError", str(error)) from error
-        await self._bridge.fresh()
+        await self._bridge.get_fresh_snapshot()
         self.look()
-        return self._done(request, None)
+        return self._make_done(request, None)
 
     async def answer(self, request: SecopRequest) -> bytes:
         """The answer to all but `activate`, `deactivate` and STOP; Refusal."""
@@ -129,60 +131,60 @@ class Node:
             case "describe":
                 return self.description
             case "read":
-                place = self._parameter(request, "value")
-                return self._line("reply", "error_read", place, request.specifier)
+                place = self._get_parameter_path(request, "value")
+                return self._make_line("reply", "error_read", place, request.specifier)
             case "change":
                 return await self._change(request)
             case "do":
                 return await self._do(request)
             case "ping":
-                return message("pong", request.specifier, report(None, self._now_s()))
+                return make_message("pong", request.specifier, make_report(None, self._now_s()))
             case "help":
-                return message("helping", "", _HELP)
+                return make_message("helping", "", _HELP)
             case action if action == IDENTIFY:
                 return f"{IDENTIFICATION}\n".encode()
             case _:
                 raise Refusal("ProtocolError", f"there are {IDENTIFY}, {', '.join(ANSWERS)}")
 
-    def module(self, name: str) -> Module:
+    def get_module(self, name: str) -> Module:
         """Refusal when there is none of that name."""
         if name not in self.modules:
             raise Refusal("NoSuchModule", f"there are {', '.join(self.modules)}")
         return self.modules[name]
 
     async def _change(self, request: SecopRequest) -> bytes:
-        name, parameter = place = self._parameter(request, "target")
+        name, parameter = place = self._get_parameter_path(request, "target")
         module = self.modules[name]
         found = module.parameters[parameter]
         if found.change is None:
             raise Refusal("ReadOnly", f"{name}:{parameter} can only be read")
-        value = taken(found.info, request.value())
-        await self._ordered(found.change(value), name, value)
-        return self._line("changed", "error_change", place, request.specifier)
+        value = check_value(found.info, request.value())
+        await self._perform_order(found.change(value), name, value)
+        return self._make_line("changed", "error_change", place, request.specifier)
 
     async def _do(self, request: SecopRequest) -> bytes:
         name, word = request.place
-        module = self.module(name)
+        module = self.get_module(name)
         command = module.commands.get(word)
         if command is None:
             raise Refusal("NoSuchCommand", f"{name} has {', '.join(module.commands) or 'no commands'}")
-        argument = self._argument(command, request)
+        argument = self._get_argument(command, request)
         if command.order is None:
-            return self._done(request, None)
+            return self._make_done(request, None)
         if self._read_only:
             raise Refusal("Disabled", "SECoP may look and do run:stop here, but order nothing: it is read-only")
-        came = await self._ordered(command.order(argument), name, None)
-        return self._done(request, came.id if isinstance(came, QueuedRun) else None)
+        came = await self._perform_order(command.order(argument), name, None)
+        return self._make_done(request, came.id if isinstance(came, QueuedRun) else None)
 
-    def _argument(self, command: ModuleCommand, request: SecopRequest) -> JsonValue:
+    def _get_argument(self, command: ModuleCommand, request: SecopRequest) -> JsonValue:
         value = request.value()
         if command.argument is not None:
-            return taken(command.argument, value)
+            return check_value(command.argument, value)
         if value is not None:
             raise Refusal("WrongType", "this command takes no argument")
         return None
 
-    async def _ordered(self, order: ServiceOrder, name: str, target: JsonValue) -> BaseModel:
+    async def _perform_order(self, order: ServiceOrder, name: str, target: JsonValue) -> BaseModel:
         """What came of it; what it changes at once has been sent when this returns."""
 
         module, began_ns = self.modules[name], self._bridge.snapshot.state.now_ns
@@ -194,19 +196,19 @@ class Node:
         except ValidationError as error:
             raise Refusal("RangeError", error.errors()[0]["msg"]) from error
         except (StandError, NoAnswer) as error:
-            raise _refusal(error, (await self._bridge.fresh()).state) from error
+            raise _make_refusal(error, (await self._bridge.get_fresh_snapshot()).state) from error
         except Exception as error:
             self._failed(error)
             raise Refusal("InternalError", f"failed ({type(error).__name__}); the stand's events say more") from error
-        snapshot = await self._bridge.fresh()
+        snapshot = await self._bridge.get_fresh_snapshot()
         if module.device:
             self._drives[name].order(target, began_ns if module.is_read_after else snapshot.state.now_ns)
         self.look()
         return came
 
-    def _parameter(self, request: SecopRequest, default: str) -> Place:
+    def _get_parameter_path(self, request: SecopRequest, default: str) -> ParameterPath:
         name, parameter = request.place
-        module = self.module(name)
+        module = self.get_module(name)
         parameter = parameter or default
         if parameter not in module.parameters:
             raise Refusal("NoSuchParameter", f"{name} has {', '.join(module.parameters)}")
@@ -215,50 +217,50 @@ class Node:
     def _has_changed(self, snapshot: StateSnapshot, name: str, parameter: str) -> bool:
         place, state = (name, parameter), snapshot.state
         seen = ModuleView(state, self._drives[name])
-        now = _SILENT if snapshot.age_s > _OLD_S else self.modules[name].parameters[parameter].report(seen)
+        now = _SILENT if snapshot.age_s > _OLD_S else self.modules[name].parameters[parameter].make_report(seen)
         before = self._reported.get(place)
         if before is not None and before.report == now:
             return False
-        time_ns = now.time_ns if isinstance(now, KnownValue) else None
-        self._reported[place] = _Reported(now, _utc_s(state, state.now_ns if time_ns is None else time_ns))
+        time_ns = now.time_ns if isinstance(now, TimedValue) else None
+        self._reported[place] = _Reported(now, _compute_utc_s(state, state.now_ns if time_ns is None else time_ns))
         return True
 
-    def _line(self, word: str, error_word: str, place: Place, specifier: str = "") -> bytes:
+    def _make_line(self, word: str, error_word: str, place: ParameterPath, specifier: str = "") -> bytes:
         last, specifier = self._reported[place], specifier or ":".join(place)
         if isinstance(last.report, Refusal):
             qualifiers = {"t": round(last.t_s, 6)}
-            return message(error_word, specifier, [last.report.error, last.report.text, qualifiers])
-        return message(word, specifier, report(last.report.value, last.t_s))
+            return make_message(error_word, specifier, [last.report.error, last.report.text, qualifiers])
+        return make_message(word, specifier, make_report(last.report.value, last.t_s))
 
-    def _done(self, request: SecopRequest, result: JsonValue) -> bytes:
-        return message("done", request.specifier, report(result, self._now_s()))
+    def _make_done(self, request: SecopRequest, result: JsonValue) -> bytes:
+        return make_message("done", request.specifier, make_report(result, self._now_s()))
 
     def _now_s(self) -> float:
         snapshot = self._bridge.snapshot
-        return _utc_s(snapshot.state, snapshot.state.now_ns) + snapshot.age_s
+        return _compute_utc_s(snapshot.state, snapshot.state.now_ns) + snapshot.age_s
 
 
-def _utc_s(state: StandState, time_ns: int) -> float:
+def _compute_utc_s(state: StandState, time_ns: int) -> float:
     return (time_ns + state.utc_offset_ns) / NS_PER_S
 
 
-def _description(state: StandState, found: dict[str, Module]) -> dict[str, object]:
+def _make_description(state: StandState, found: dict[str, Module]) -> dict[str, object]:
     return {
         "equipment_id": f"thermostand.{re.sub(r'[^A-Za-z0-9_.-]+', '-', state.stand)}",
         "firmware": f"thermostand {state.version}",
         "description": f"{state.stand}: a thermal chamber for cameras" + (", simulated" if state.simulated else ""),
-        "modules": {name: module.described() for name, module in found.items()},
+        "modules": {name: module.describe() for name, module in found.items()},
     }
 
 
-def _refusal(error: Exception, state: StandState) -> Refusal:
+def _make_refusal(error: Exception, state: StandState) -> Refusal:
     """SECoP's class of what an order was refused for. What a device said is the cause of a Conflict."""
     while isinstance(error, Conflict) and isinstance(error.__cause__, StandError):
         error = error.__cause__
-    return Refusal(_class_of(error, state), str(error))
+    return Refusal(_get_error_class(error, state), str(error))
 
 
-def _class_of(error: Exception, state: StandState) -> ErrorClass:
+def _get_error_class(error: Exception, state: StandState) -> ErrorClass:
     match error:
         case NoAnswer():
             return "TimeoutError"

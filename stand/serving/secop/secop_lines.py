@@ -88,7 +88,7 @@ class SecopRequest:
             raise Refusal("BadJSON", "the data is no JSON value") from None
 
 
-def parsed(line: bytes) -> SecopRequest:
+def parse_request(line: bytes) -> SecopRequest:
     """A line without its end; a CR before that is left out. An empty one asks for help. Refusal when it is no UTF-8."""
     try:
         text = line.removesuffix(b"\r").decode()
@@ -99,7 +99,7 @@ def parsed(line: bytes) -> SecopRequest:
     return SecopRequest(action or "help", specifier, data)
 
 
-def message(action: str, specifier: str = "", content: object = None) -> bytes:
+def make_message(action: str, specifier: str = "", content: object = None) -> bytes:
     """A line with its end; `content` as JSON, none without it. NaN and infinities are a ValueError: SECoP has none."""
     words = action if content is None and not specifier else f"{action} {specifier}"
     if content is not None:
@@ -107,15 +107,15 @@ def message(action: str, specifier: str = "", content: object = None) -> bytes:
     return words.encode("utf-8", "replace") + b"\n"
 
 
-def report(value: object, t_s: float) -> list[object]:
+def make_report(value: object, t_s: float) -> list[object]:
     """A data report; t_s: when the value was obtained, s since the epoch, UTC."""
     return [value, {"t": round(t_s, 6)}]
 
 
-def refused(request: SecopRequest, refusal: Refusal) -> bytes:
+def make_error_reply(request: SecopRequest, refusal: Refusal) -> bytes:
     """The answer to what is refused."""
     action = f"error_{request.action[:_ECHO]}"
-    return message(action, request.specifier[:_ECHO], [refusal.error, refusal.text, {}])
+    return make_message(action, request.specifier[:_ECHO], [refusal.error, refusal.text, {}])
 
 
 def _no_number(text: str) -> NoReturn:

@@ -1,0 +1,441 @@
+"""Observations from plain arrays or a CSV table: a fit of centres measured elsewhere needs no session and no stand."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from thermostand.compensation.camera_selection import read_frame_temperatures
+from thermostand.compensation.history.thermal_history import (
+    States,
+    ThermalHistory,
+    ThermalStateSpec,
+    compute_states_at,
+    read_history,
+    refine_temperature,
+)
+from thermostand.compensation.observations import Float, Observations, SessionFacts
+from thermostand.compensation.value_checks import LARGEST_SIDE_px, check_centres, check_degC
+from thermostand.experiments.steps import Role
+from thermostand.foundation.clock import NS_PER_S
+from thermostand.foundation.errors import SessionError
+from thermostand.markers.target import Target
+from thermostand.recording.reading.interpolation import interpolate
+from thermostand.recording.reading.session import Session
+
+Row = Mapping[str, str]
+
+
+def read_rows(path: Path, needed: Sequence[str], why: str) -> tuple[list[dict[str, str]], Sequence[str]]:
+    """The rows, and the names of all columns; SessionError when it is no table, lacks one of the `needed` columns
+    (`why` follows the name of the first), or a row has not as many cells as the first line."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, strict=True)
+            rows = list(reader)
+            columns = reader.fieldnames or ()
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SessionError(f"{path}: cannot be read as a CSV table ({error})") from error
+    if missing := [name for name in needed if name not in columns]:
+        raise SessionError(f"{path}: has no column {missing[0]}; {why}")
+    for line, row in enumerate(rows, 2):
+        if None in row or None in row.values():
+            raise SessionError(f"{path}: line {line} has not as many cells as the first line")
+    return rows, columns
+
+
+def parse_column(path: Path, rows: Sequence[Row], column: str) -> NDArray[np.float64]:
+    """(M,): a column's values, NaN for `nan` and empty cells; SessionError that names the line of anything else."""
+    return np.array([_parse_number(path, line, column, row[column].strip()) for line, row in enumerate(rows, 2)])
+
+
+def _parse_number(path: Path, line: int, column: str, text: str) -> float:
+    try:
+        value = float(text) if text else math.nan
+    except ValueError:
+        raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a number") from None
+    if math.isinf(value):
+        raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a finite number")
+    return value
+
+
+Column = tuple[ArrayLike, ArrayLike]
+"""Instants, ns, ascending, and values."""
+
+
+class StatefulModel(Protocol):
+    """A drift model."""
+
+    @property
+    def memory(self) -> ThermalStateSpec:
+        """What has to be remembered for it."""
+        ...
+
+
+def states(
+    model: StatefulModel,
+    session: Session | None = None,
+    time_ns: ArrayLike | None = None,
+    camera_degC: ArrayLike | None = None,
+    *,
+    air: Column | None = None,
+    supply: Column | None = None,
+    camera: Column | None = None,
+) -> States:
+    """The camera's thermal state at F instants, for `model.correct(points, states(...))`: one state for all points, or
+    one for each.
+
+    Of a session: at its frames, or at `time_ns` (F,), ascending. Of arrays: `time_ns` and, from the time before it on,
+    `air` near the camera, degC; `supply`, 0 or 1, until the next instant (else the camera is on); `camera`, its own
+    temperature between the frames, degC. camera_degC (F,): its own at the instants, where it is known better.
+    ValueError when neither a session nor `time_ns` with `air` is given, or shapes do not agree.
+    """
+    if session is None:
+        if time_ns is None or air is None:
+            raise ValueError(
+                "give a session, or time_ns and air=(time_ns, degC): a thermal state follows from the past"
+            )
+        instants, own = _check_instants(time_ns, camera_degC)
+        return compute_states_at(build_history(air, supply, camera, instants, own), model.memory, instants, own)
+    if air is not None or supply is not None or camera is not None:
+        raise ValueError("air, supply and camera belong to arrays; a session has recorded them")
+    recorded_degC = read_frame_temperatures(session)
+    wanted = session.frame_times_ns if time_ns is None else time_ns
+    instants, own = _check_instants(wanted, camera_degC)
+    if camera_degC is None:
+        own = np.array([recorded_degC.get(instant, math.nan) for instant in instants.tolist()])
+    return compute_states_at(read_history(session), model.memory, instants, own)
+
+
+def build_history(
+    air: Column, supply: Column | None, camera: Column | None, time_ns: NDArray[np.int64], camera_degC: Float
+) -> ThermalHistory:
+    """What lags are computed from; ValueError when a column is none. A camera without `supply` is on, for it has
+    temperatures, and without `camera` what it read at the frames is all that is known of its own."""
+    frames = time_ns, camera_degC
+    powered = (np.empty(0, np.int64), np.empty(0)) if supply is None else _check_column("supply", supply)
+    if np.any((powered[1] != 0) & (powered[1] != 1)):
+        raise ValueError("supply: expected 0 (off) and 1 (on)")
+    own = frames if camera is None else _check_column("camera", camera)
+    measured = np.isfinite(own[1])
+    return refine_temperature(ThermalHistory(*_check_column("air", air), *powered, own[0][measured], own[1][measured]))
+
+
+def _check_column(name: str, given: Column) -> tuple[NDArray[np.int64], Float]:
+    """Finite values with their instants."""
+    if len(given) != 2:
+        raise ValueError(f"{name}: expected (time_ns, values), not {len(given)} columns")
+    try:
+        time_ns, values = np.array(given[0], np.int64), np.array(given[1], np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"{name}: expected numbers ({error})") from error
+    if time_ns.ndim != 1 or time_ns.shape != values.shape:
+        raise ValueError(
+            f"{name}: expected (time_ns, values), two columns of the same length, not {time_ns.shape}, {values.shape}"
+        )
+    if np.any(np.diff(time_ns) < 0):
+        raise ValueError(f"{name}: its time_ns go backwards; give them in order of time")
+    if name != "supply":
+        check_degC(name, values)
+    good = np.isfinite(values)
+    return time_ns[good], values[good]
+
+
+def _check_instants(time_ns: ArrayLike, camera_degC: ArrayLike | None) -> tuple[NDArray[np.int64], Float]:
+    instants = np.atleast_1d(np.array(time_ns, np.int64))
+    own = np.full(len(instants), np.nan) if camera_degC is None else np.atleast_1d(np.array(camera_degC, np.float64))
+    if instants.ndim != 1 or own.shape != instants.shape:
+        raise ValueError(f"time_ns and camera_degC are (F,), not {instants.shape} and {own.shape}")
+    if np.any(np.diff(instants) < 0):
+        raise ValueError("time_ns go backwards; give the instants in order of time")
+    return instants, own
+
+
+NEEDED = ("frame", "marker", "x_px", "y_px", "camera_degC")
+OF_FRAMES = ("camera_degC", "time_ns", "chamber_degC", "role", "air_degC")
+_COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+_ROW_EACH = f"it needs {', '.join(NEEDED)}, a row for each centre"
+_MOST_FRAMES, _MOST_MARKERS = 1_000_000, 100_000
+Index = NDArray[np.int64]
+
+
+def load_observations(path: Path, camera_serial: str = "") -> Observations:
+    """A row for each centre: frame and marker (whole numbers from 0 on, in any order), x_px, y_px and camera_degC; and,
+    where they are known, time_ns, chamber_degC (the set-point), role, air_degC (of the air near the camera, for the
+    thermal form), var_x_px2, cov_xy_px2 and var_y_px2.
+
+    A marker without a row, or with an empty place, is missing. SessionError that names file, line and column.
+    """
+    rows = _read_centre_rows(path)
+    frame, frame_at = _index_numbers(path, rows, "frame", _MOST_FRAMES)
+    marker, marker_at = _index_numbers(path, rows, "marker", _MOST_MARKERS)
+    pairs, first = np.unique(np.column_stack([frame_at, marker_at]), axis=0, return_index=True)
+    if len(pairs) < len(rows):
+        line = int(np.setdiff1d(np.arange(len(rows)), first)[0])
+        raise SessionError(f"{path}: line {line + 2}: frame {rows[line]['frame']} has this marker already")
+    shape = (len(frame), int(marker.max()) + 1)
+    centres, covariance = np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
+    at = frame_at, marker[marker_at]
+    centres[at] = np.column_stack([parse_column(path, rows, "x_px"), parse_column(path, rows, "y_px")])
+    of_frames = {name: _collect_frame_texts(path, rows, frame_at, name) for name in OF_FRAMES if name in rows[0]}
+    times = of_frames.get("time_ns")
+    time_ns = None if times is None else np.array([_parse_instant(path, text) for text in times], np.int64)
+    if time_ns is not None and (np.diff(time_ns) <= 0).any():
+        raise SessionError(f"{path}: time_ns does not grow from frame to frame; number the frames in order of time")
+    air = _parse_temperatures(path, of_frames, "air_degC")
+    if air is not None and time_ns is None:
+        raise SessionError(f"{path}: has air_degC without time_ns; the thermal form needs both")
+    camera_degC = _parse_temperatures(path, of_frames, "camera_degC")
+    if _COVARIANCE[0] in rows[0]:
+        covariance[at] = _parse_covariances(path, rows)
+    try:
+        return observations_of(
+            centres,
+            np.empty(0) if camera_degC is None else camera_degC,
+            time_ns,
+            chamber_degC=_parse_temperatures(path, of_frames, "chamber_degC"),
+            role=_check_roles(path, of_frames.get("role")),
+            air=None if air is None or time_ns is None else (time_ns, air),
+            covariance_px2=covariance if _COVARIANCE[0] in rows[0] else None,
+            camera_serial=camera_serial,
+            name=path.stem,
+        )
+    except ValueError as error:
+        raise SessionError(f"{path}: {error}") from error
+
+
+def _read_centre_rows(path: Path) -> list[dict[str, str]]:
+    rows, columns = read_rows(path, NEEDED, _ROW_EACH)
+    missing = [name for name in _COVARIANCE if name not in columns]
+    if missing and len(missing) < len(_COVARIANCE):
+        raise SessionError(f"{path}: has no column {missing[0]}; {_ROW_EACH}")
+    if not rows:
+        raise SessionError(f"{path}: has no rows; it needs one for each centre")
+    return rows
+
+
+def _index_numbers(path: Path, rows: Sequence[Row], column: str, most: int) -> tuple[Index, Index]:
+    """The numbers that occur, ascending, and each row's index among them."""
+    for line, row in enumerate(rows, 2):
+        text = row[column].strip()
+        if not text.isdecimal() or int(text) >= most:
+            raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a whole number from 0 on below {most}")
+    found, at = np.unique(np.array([int(row[column]) for row in rows], np.int64), return_inverse=True)
+    return found, at.ravel().astype(np.int64)
+
+
+def _parse_covariances(path: Path, rows: Sequence[Row]) -> Float:
+    """(M, 2, 2); SessionError where it is none."""
+    xx, xy, yy = (parse_column(path, rows, name) for name in _COVARIANCE)
+    placed = np.array([bool(row["x_px"].strip()) for row in rows])
+    wrong = placed & ~((xx > 0) & (yy > 0) & (xx * yy > xy**2))
+    if wrong.any():
+        line = int(np.flatnonzero(wrong)[0]) + 2
+        raise SessionError(f"{path}: line {line}: {', '.join(_COVARIANCE)} are no covariance of a centre")
+    return np.stack([np.stack([xx, xy], axis=1), np.stack([xy, yy], axis=1)], axis=1)
+
+
+def _collect_frame_texts(path: Path, rows: Sequence[Row], frame_at: Index, column: str) -> list[str]:
+    """The text of each frame, which is the same in all of its rows."""
+    found: dict[int, str] = {}
+    for line, (index, row) in enumerate(zip(frame_at.tolist(), rows, strict=True), 2):
+        if found.setdefault(index, row[column].strip()) != row[column].strip():
+            raise SessionError(
+                f"{path}: line {line}: {column} of frame {row['frame']} is another one in an earlier line"
+            )
+    return [found[index] for index in range(len(found))]
+
+
+def _parse_temperatures(path: Path, of_frames: Mapping[str, list[str]], column: str) -> Float | None:
+    texts = of_frames.get(column)
+    if texts is None:
+        return None
+    try:
+        return np.array([float(text) if text else math.nan for text in texts])
+    except ValueError as error:
+        raise SessionError(f"{path}: {column}: {error}") from None
+
+
+def _parse_instant(path: Path, text: str) -> int:
+    if not text.isdecimal():
+        raise SessionError(f"{path}: time_ns is {text!r}, not a whole number of nanoseconds")
+    return int(text)
+
+
+def _check_roles(path: Path, texts: list[str] | None) -> list[str] | None:
+    known = [str(role) for role in Role]
+    for text in texts or []:
+        if text not in known:
+            raise SessionError(f"{path}: role is {text!r}, not one of {', '.join(known)}")
+    return texts
+
+
+_SPACING_mm = 1.0
+# A fit's own covariance is symmetric to rounding only; given back as it is, it has to be accepted.
+_ROUNDING = 1e-9
+
+
+def observations_of(
+    centres_px: ArrayLike,
+    camera_degC: ArrayLike,
+    time_ns: ArrayLike | None = None,
+    *,
+    chamber_degC: ArrayLike | None = None,
+    reference_degC: float | None = None,
+    role: ArrayLike | None = None,
+    air: Column | None = None,
+    supply: Column | None = None,
+    camera: Column | None = None,
+    sigma_px: float = 0.01,
+    covariance_px2: ArrayLike | None = None,
+    image_size: tuple[int, int] | None = None,
+    target: Target | None = None,
+    camera_serial: str = "",
+    name: str = "arrays",
+) -> Observations:
+    """F frames of N markers of one camera.
+
+    centres_px (F, N, 2): (x, y), NaN where a marker is missing. camera_degC (F,): the camera's own, NaN: the frame is
+    not used. time_ns (F,): middle of the exposure, ascending; else a frame a second. chamber_degC (F,): the set-point,
+    whose frames are left out together to choose a model; else camera_degC in whole degrees. role (F,): of
+    experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first frame)
+    and `fit` at the others. air: (time_ns, degC), both (A,), near the camera, for the thermal form; with it
+    supply: (time_ns, 0 or 1), when the camera was off and on, else it was on all the time; camera: (time_ns, degC), its
+    own readings between the frames, else it is taken to go straight from one to the next. sigma_px: standard
+    uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width, height), else what
+    holds the centres. ValueError when shapes do not agree, or something cannot be what it is given as.
+    """
+    centres, own = _check_centres(centres_px, camera_degC)
+    if air is None and (supply is not None or camera is not None):
+        raise ValueError("supply and camera say more of a camera's past only together with air")
+    frames, count = centres.shape[:2]
+    instants, chamber, roles = _fill_frame_columns(own, time_ns, chamber_degC, role, reference_degC)
+    missing, size = np.isnan(centres).any(axis=2) | np.isnan(own)[:, None], image_size or _estimate_image_size(centres)
+    check_centres("centres_px", centres, size)
+    covariance = _check_covariance(covariance_px2, sigma_px, missing)
+    history = None if air is None else build_history(air, supply, camera, instants, own)
+    return Observations(
+        target=target or _make_anonymous_target(count),
+        sessions=(SessionFacts(name, "", camera_serial, "", "", simulated=None, incomplete=0),),
+        image_size=size,
+        preview=np.zeros((max(1, size[1] // 8), max(1, size[0] // 8)), np.uint8),
+        session=np.zeros(frames, np.int64),
+        frame=np.arange(frames),
+        time_ns=instants,
+        role=roles,
+        step_id=("",) * frames,
+        chamber_degC=chamber,
+        camera_degC=own,
+        air_degC=_interpolate_air(history, instants),
+        centres_px=np.where(missing[..., None], np.nan, centres),
+        covariance_px2=np.where(missing[..., None, None], np.nan, covariance),
+        flags=np.zeros((frames, count), np.uint8),
+        reasons=tuple(map(_explain_unusable, own.tolist(), np.all(missing, axis=1).tolist())),
+        histories=() if history is None else (history,),
+    )
+
+
+def _check_covariance(covariance_px2: ArrayLike | None, sigma_px: float, missing: NDArray[np.bool_]) -> Float:
+    """What is given, else that of coordinates with this uncertainty each, for all of (F, N, 2, 2); ValueError when it
+    is no covariance of a centre that is there."""
+    if covariance_px2 is None:
+        if not sigma_px > 0:
+            raise ValueError(f"sigma_px is {sigma_px}; expected one above 0")
+        return np.eye(2) * sigma_px**2
+    given, shape = _to_array("covariance_px2", covariance_px2), (*missing.shape, 2, 2)
+    if given.shape not in ((2, 2), shape):
+        raise ValueError(f"covariance_px2 has shape {given.shape}, not {shape} or, one for all, (2, 2)")
+    whole = np.broadcast_to(given, shape)
+    xx, xy, yx, yy = whole.reshape(-1, 4).T
+    symmetric = np.abs(xy - yx) <= _ROUNDING * np.abs(xx + yy)  # a fit's own is so to rounding
+    sound = ((xx > 0) & (yy > 0) & (xx * yy > xy**2) & symmetric & np.isfinite(xx + yy)).reshape(missing.shape)
+    if wrong := np.argwhere(~missing & ~sound).tolist():
+        frame, marker = wrong[0]
+        raise ValueError(
+            f"covariance_px2 of frame {frame}, marker {marker} is no covariance: {whole[frame, marker].tolist()}"
+        )
+    return whole
+
+
+def _to_array(what: str, given: ArrayLike) -> Float:
+    """As an array; ValueError that says which argument holds no numbers, or rows of different lengths."""
+    try:
+        return np.array(given, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{what}: expected numbers, as many in each row ({error})") from error
+
+
+def _check_centres(centres_px: ArrayLike, camera_degC: ArrayLike) -> tuple[Float, Float]:
+    """Centres (F, N, 2) and temperatures (F,); ValueError when they are not."""
+    centres, camera = _to_array("centres_px", centres_px), _to_array("camera_degC", camera_degC)
+    if centres.ndim != 3 or centres.shape[2] != 2 or camera.shape != centres.shape[:1] or not len(camera):
+        raise ValueError(f"centres are (F, N, 2) and temperatures (F,), not {centres.shape} and {camera.shape}")
+    if not np.isfinite(centres).all(axis=2).any():
+        raise ValueError(f"none of the {len(centres)} frames has a centre: centres_px are all NaN")
+    check_degC("camera_degC", camera)
+    return centres, camera
+
+
+def _fill_frame_columns(
+    camera_degC: Float,
+    time_ns: ArrayLike | None,
+    chamber_degC: ArrayLike | None,
+    role: ArrayLike | None,
+    reference_degC: float | None,
+) -> tuple[NDArray[np.int64], Float, NDArray[np.str_]]:
+    """Instants, set-points and roles (F,) of the frames, as given or as supposed; ValueError when one is not (F,)."""
+    frames = len(camera_degC)
+    if chamber_degC is not None:
+        check_degC("chamber_degC", _to_array("chamber_degC", chamber_degC))
+    instants = np.arange(frames) * NS_PER_S if time_ns is None else np.array(time_ns, np.int64)
+    chamber = np.round(camera_degC) if chamber_degC is None else np.array(chamber_degC, np.float64)
+    roles = _assign_default_roles(chamber, reference_degC) if role is None else np.array(role, np.str_)
+    for what, column in (("time_ns", instants), ("chamber_degC", chamber), ("role", roles)):
+        if column.shape != (frames,):
+            raise ValueError(f"{what} has shape {column.shape}, not ({frames},)")
+    if (falls := np.flatnonzero(np.diff(instants) <= 0)).size:
+        raise ValueError(f"time_ns does not grow at frame {falls[0] + 1}; give the frames in order of time")
+    known = [str(each) for each in Role]
+    if unknown := sorted(set(roles.tolist()) - set(known)):
+        raise ValueError(f"role has {unknown[0]!r}; there are {', '.join(known)}")
+    return instants, chamber, roles
+
+
+def _estimate_image_size(centres_px: Float) -> tuple[int, int]:
+    """(width, height) of an image that holds all centres (F, N, 2), of at most the size of a sensor."""
+    width, height = np.clip(np.ceil(np.nanmax(centres_px, axis=(0, 1))) + 1, 1, LARGEST_SIDE_px)
+    return int(width), int(height)
+
+
+def _interpolate_air(history: ThermalHistory | None, time_ns: NDArray[np.int64]) -> Float:
+    """The air's temperature at these instants, NaN where it is not known."""
+    if history is None:
+        return np.full(len(time_ns), np.nan)
+    return interpolate(history.ambient_ns, history.ambient_degC, time_ns)
+
+
+def _explain_unusable(camera_degC: float, unseen: bool) -> str:
+    if math.isnan(camera_degC):
+        return "the camera's temperature is unknown"
+    return "no marker has a centre" if unseen else ""
+
+
+def _assign_default_roles(chamber_degC: Float, reference_degC: float | None) -> NDArray[np.str_]:
+    """`reference` at the set-point nearest to the wanted one, `fit` at the others."""
+    known = np.unique(chamber_degC[np.isfinite(chamber_degC)])
+    wanted = chamber_degC[0] if reference_degC is None else reference_degC
+    nearest = known[np.argmin(np.abs(known - wanted))] if len(known) else math.nan
+    return np.where(chamber_degC == nearest, str(Role.REFERENCE), str(Role.FIT))
+
+
+def _make_anonymous_target(count: int) -> Target:
+    """N markers in no known order: models are of the image, and do not ask where the markers are on the target."""
+    return Target.model_construct(
+        name="", columns=count, rows=1, pitch_mm=_SPACING_mm, diameter_mm=_SPACING_mm / 3, minimum_markers=None
+    )
