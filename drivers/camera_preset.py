@@ -83,7 +83,7 @@ class FarAirNumbers(Document):
 
 class CameraPreset(Document):
     """What temperature does to a camera, each number within bounds that somebody has published or, where nobody has,
-    that are said to be assumed. Positions in px of the simulated sensor (3.45 um).
+    that are marked as assumed. Positions in px of the simulated sensor (3.45 um).
 
     scale_ppm_per_K: of the image. principal_point_px_per_K: how far it goes, in a direction of its own. settling_min:
     the slowest time constant of its parts. self_heating_K: of the chip above the air. radial_per_K: of Brown's k1.

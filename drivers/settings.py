@@ -1,6 +1,6 @@
 """What the settings of several devices have in common.
 
-A driver's settings are one frozen model beside it: what a stand's file has, what is checked, what the driver takes.
+A driver's settings are one frozen model in its module: what a stand's file has, what is checked, what the driver takes.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class CameraSettings(Polled):
     ambient_degC: the lowest and the highest air that its data sheet allows; no set-point goes outside.
     ambient_K_per_min: how fast that air may change; no set-point changes faster.
     self_heating_K: how far above the air near it its own temperature is at rest, lowest and highest, negative for a
-    cooled one; outside it is doubted. None: above that air.
+    cooled one; outside, its readings are suspect. None: above that air.
     lens: which one is on it, in words; recorded with each session.
     """
 

@@ -1,11 +1,11 @@
 """A thermal cycle that decides (`until: known`): its decisions as steps.
 
-The plan always holds a whole night: behind the step `Decide` stand the fixed visits that are left. A decision puts a
+The plan always holds a whole run: behind the step `Decide` stand the fixed visits that are left. A decision puts a
 visit, and the next `Decide`, before them, and takes as many of the fixed ones away as its time would have paid for: a
-night that gets no more decisions continues with the fixed plan, and none takes much longer than that.
+run that gets no more decisions continues with the fixed plan, and none takes much longer than that.
 
 Every third visit is followed by one of a held-out temperature, and those that are left are visited at the end: what
-compensation leaves there is measured in the same night.
+compensation leaves there is measured in the same run.
 """
 
 from __future__ import annotations

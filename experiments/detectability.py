@@ -10,13 +10,13 @@ from thermostand.experiments.steps import Capture, PlannedStep, Role
 
 _DRIFT_ROLES = (Role.REFERENCE, Role.FIT, Role.VALIDATION)
 _SMALLEST_STEPS = ((14, 0.05), (8, 0.3))
-"""Looks, and the smallest step, px, that was found in each of 6 to 8 nights of drawn cameras with as many: 25 and 14
-looks, with and without set-points seen before, showed 50 mpx, 13 that in 5 of 6 nights, 8 looks 300 mpx."""
+"""Looks, and the smallest step, px, that was found in each of 6 to 8 sessions of drawn cameras with as many: 25 and 14
+looks, with and without set-points seen before, showed 50 mpx, 13 that in 5 of 6 sessions, 8 looks 300 mpx."""
 
 
 @dataclass(frozen=True, slots=True)
 class Detectability:
-    """How often a plan looks at the target for its drift. bump_px: the smallest step of the image that nights with as
+    """How often a plan looks at the target for its drift. bump_px: the smallest step of the image that sessions with as
     many looks have shown; None where none can be distinguished from drift."""
 
     count: int

@@ -72,7 +72,7 @@ class Settled(Document):
 
 
 class Known(Document):
-    """Experimental: when enough is known of a camera, and within what the night decides; see steps.Decide.
+    """Experimental: when enough is known of a camera, and within what the run decides; see steps.Decide.
 
     states: those in which the model is wanted, throughout the range of the set-points: of a camera at rest, 4 h after a
     change, or on the way, 45 min after it. wait_s: for a decision, in real time.

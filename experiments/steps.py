@@ -41,7 +41,7 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.plugins import load_point
 
 GROUP = "thermostand.steps"
-LABORATORY_degC = 24.0  # where the chamber begins a night; the paper's room (section 3.1)
+LABORATORY_degC = 24.0  # where the chamber begins a run; the room temperature of the paper (section 3.1)
 
 
 class Role(StrEnum):
@@ -200,7 +200,7 @@ STEPS: dict[str, type[Step]] = {}
 
 
 class Step:
-    """A step, and all that is to be said of its kind; a subclass is a frozen dataclass.
+    """A step, and everything that describes its kind; a subclass is a frozen dataclass.
 
     kind: its name. is_setup: whether it brings about a state, which is restored after an interruption; the others are
     work, done once. ends_when_skipped: whether work under way can be broken off. at_set_point: it takes frames, and has
@@ -585,7 +585,7 @@ def _require_set_point(degC: float | None, remedy: str) -> float:
     return degC
 
 
-# A flap's travel with its confirmation, until recorded nights have shown better, s.
+# A flap's travel with its confirmation, until recorded sessions have shown better, s.
 _FLAP_TRAVEL_S = 3.0
 _FLAP_AT_REST_S = 0.2
 
@@ -706,7 +706,7 @@ class Capture(Step):
         return replace(found, camera_was_on=True)
 
 
-# Homing from near the switch, and the confirmation of a move, until recorded nights have shown better, s.
+# Homing from near the switch, and the confirmation of a move, until recorded sessions have shown better, s.
 _HOMING_S = 15.0
 _MOVE_CONFIRMED_S = 0.1
 

@@ -1,1 +1,1 @@
-"""What every room speaks: errors, readings, items, time, YAML documents, files that appear whole."""
+"""What every package uses: errors, readings, items, time, YAML documents, files that appear whole."""

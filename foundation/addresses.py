@@ -63,8 +63,8 @@ _DISPLAY_ADDRESSES: dict[str, str] = {}  # where a stand's simulator answers -> 
 
 
 def set_display_address(address: str, stated: str) -> None:
-    """From now on `stated` is said where something is said of `address`: a simulator answers at a free place, which is
-    another one each time, and the messages of a run are recorded."""
+    """From now on messages show `stated` for `address`: a simulator answers at a free port, which differs each time,
+    and the messages of a run are recorded."""
     _DISPLAY_ADDRESSES[address] = stated
 
 

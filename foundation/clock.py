@@ -223,7 +223,7 @@ class VirtualClock:
             self._changed.set()
 
     async def run(self) -> None:
-        """Drive time until cancelled; run it as a task beside the tasks that sleep on this clock. Raises what `advance`
+        """Drive time until cancelled; run it as a task along with those that sleep on this clock. Raises what `advance`
         raises; time goes on without it, since what ends a run sleeps, too."""
         while True:
             await self._rest()
@@ -275,6 +275,6 @@ def _get_ready_callbacks(loop: asyncio.AbstractEventLoop) -> Sized:
     """The callbacks that `loop` will run next, without the one that runs now.
 
     asyncio keeps them to itself, under this name in every version so far. Counting quiet turns of the loop instead is a
-    guess, and six turns for each sleeper were a quarter of the time of a polled night.
+    guess, and six turns for each sleeper were a quarter of the time of a polled session.
     """
     return vars(loop)["_ready"]

@@ -27,7 +27,7 @@ else:
     from yaml import CSafeLoader as QuickLoader
 
 _LONGEST_TEXT, _MOST_VALUES = 250_000, 100_000  # of a document: a hundred times of what ours have
-_LONGEST_JSON = 20_000_000  # bytes: a night's model has 0.6 MB, one of the oldest format 5
+_LONGEST_JSON = 20_000_000  # bytes: the model of a session has 0.6 MB, one of the oldest format 5
 _MAKE_AGAIN = "; it was changed or damaged since: take it from where it was made, or make it again"
 _MOST_OPENED = 2000  # characters that may begin a level
 

@@ -16,7 +16,7 @@
     │   └── NotReset           ... and nobody has, in virtual time
     ├── SessionError           a recorded session cannot be read
     │   └── NotFound           what was named is not there: bad input, for a program
-    ├── DetectionError         no target in the image, or one that is not identified beyond doubt
+    ├── DetectionError         no target in the image, or one that is not identified with certainty
     └── CalibrationError       observations that do not determine a camera, or a pose
 
 Programming mistakes stay ValueError. Bad calls raise; bad measurements are values with a quality.
@@ -104,7 +104,7 @@ class NotFound(SessionError):
 
 
 class DetectionError(StandError):
-    """The target was not found or not identified beyond doubt; `found` counts the markers that were."""
+    """The target was not found or not identified with certainty; `found` counts the markers that were."""
 
     def __init__(self, text: str, found: int = 0) -> None:
         super().__init__(text)

@@ -1,8 +1,8 @@
-"""Every kind of event, once: what it says, how grave it is, what to do about it, and who is told elsewhere.
+"""Every kind of event, once: what it says, how grave it is, what to do about it, and who is notified elsewhere.
 
 Who has something to say publishes a row of this table: `DEVICE_BACK.at(now_ns, device="flap", lost_s=4.0)`. From the
 row come the line in the log (its text), what to type after it (`get_advice`), the message to people elsewhere
-(`make_alert`), how often it is said (`ends`, `counts`: repeats.py), and docs/troubleshooting. The guard's rules
+(`make_alert`), how often it is reported (`ends`, `counts`: repeats.py), and docs/troubleshooting. The guard's rules
 (stand/guarding) register theirs with `guard_rule`; a package of experiments may add rows with `event`.
 """
 
@@ -58,7 +58,7 @@ class EventKind(str):
     """A row; as a string it is the kind's name.
 
     text: a template of the fields that a site gives, or a function of them, whose docstring is the template that people
-    read; `{text}` is what another has said (an error, a rule), which is not repeated among the data. Besides Python's
+    read; `{text}` is the message of another (an error, a rule), which is not repeated among the data. Besides Python's
     own formats there are `utc` (of ns), `min` (of s), `GB` (of bytes), and a list is joined by commas.
     level, advice and alert may depend on the data; `cases` are the data for which they differ. advice: what helps, or
     shows more, with `{folder}` for the session's; a warning or an error has one. counts: each one is published, as it
@@ -83,7 +83,7 @@ class EventKind(str):
         """One that has happened at that instant."""
         try:
             text = self.format_text(message, **data)
-        except (LookupError, TypeError, ValueError):  # what is told must not end what tells it: a keeper, a night
+        except (LookupError, TypeError, ValueError):  # a message must not end what reports it, such as a run
             text = ", ".join([message or str(self), *(f"{name} {value}" for name, value in data.items())])
         return Event(time_ns, self.get_level(data), str(self), text, data)
 
@@ -161,7 +161,7 @@ def guard_rule(name: str, says: str, warned: str = "") -> str:
 
 
 def get_guard_kind(rule: str) -> EventKind:
-    """The row of a rule; one that has none gets one: what trips is always said."""
+    """The row of a rule; one that has none gets one: what trips is always reported."""
     if GUARD + rule not in KINDS:
         guard_rule(rule, "")
     return KINDS[GUARD + rule]
@@ -262,7 +262,7 @@ GUARD_LATE = event("guard_late", "warning",
     "the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up",
     "see what stopped or loads this computer; " + _SLEEP)
 SENSOR_BELIEVED = event("sensor_believed", "info",
-    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s in doubt: {text}",
+    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s under suspicion: {text}",
     is_limited=True)
 LATCH_NOT_KEPT = event("latch_not_kept", "error", "that the stand has tripped may be forgotten at a restart: {text}",
     "see that the folder of the stand's state is there and has room")
@@ -353,7 +353,7 @@ PICTURE_LEFT_OUT = event("picture_left_out", "warning", "{device}: {file} is lef
     "see that the imager is the one of the stand's file, and stores radiometric JPEGs")
 CLOCK_SET_BACK = event("clock_set_back", "warning",
     "{device}: its clock was set back by {by_s} s, and its pictures are dated accordingly from now on",
-    "nothing to do: its pictures are dated by the new offset; set its clock between two nights")
+    "nothing to do: its pictures are dated by the new offset; set its clock between two runs")
 
 # The camera.
 CAMERA_LOST = event("camera_lost", "warning", "{text}", CAMERA_ENDS, alert=Alert("device_lost", "camera", "lasting"))

@@ -42,7 +42,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write the text beside the place, then rename; SessionError when refused."""
+    """Write the text to a temporary file in the same folder, then rename it; SessionError when refused."""
     with open_atomic(path) as file:
         file.write(text)
 
@@ -156,7 +156,7 @@ def _make_refusal(path: Path, error: OSError) -> SessionError:
 
 @contextmanager
 def create_folder(out: Path) -> Generator[Path]:
-    """A folder beside `out` (`NAME.part`) to write into. When the block ends well it is on the disk and becomes `out`;
+    """A folder next to `out` (`NAME.part`) to write into. When the block ends well it is on the disk and becomes `out`;
     when it does not, it is removed. SessionError when `out` exists or the disk refuses."""
     part = out.parent / f"{out.name}.part"
     try:

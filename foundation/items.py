@@ -32,7 +32,7 @@ class StepMark:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something worth knowing later: a fault, a gap, a trip, the end of a run. level: info, warning or error.
+    """Something to be known later: a fault, a gap, a trip, the end of a run. level: info, warning or error.
 
     `text` is for people, `kind` and `data` (JSON-able fields) are for programs: nothing is read out of a sentence.
     """

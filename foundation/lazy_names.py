@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def make_lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package whose names are in the `__init__.pyi` beside its `file`:
+    """`__getattr__`, `__dir__` and `__all__` of a package whose names are in the `__init__.pyi` next to its `file`:
     lines such as `from thermostand.recording.reading.session import Session as Session`, which type checkers read as
     well, and `other_name = known_name`. What begins with _ is not public."""
     text = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")

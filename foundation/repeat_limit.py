@@ -2,7 +2,7 @@
 
 Three limits, by what the event's row says. A sentence: three at once, then one each 20 min. A state that begins and
 ends, such as a device that is lost and is back: the third time within an hour its end is withheld until it has lasted
-for 20 min, so that the state is told once instead of each time it begins. What begins or ends something that is counted
+for 20 min, so that the state is reported once, not each time it begins. What begins or ends something that is counted
 or waited for (`counts`) is always published, but beyond six an hour it is an information.
 """
 
@@ -81,7 +81,7 @@ class RepeatLimit:
                 return None
             again, state.end, state.again = state.again, None, 0
             return _add_count(event, again)
-        if state.end is not None:  # to those who were told it goes on
+        if state.end is not None:  # for those who were notified it goes on
             state.end = None
             state.again += 1
             return None

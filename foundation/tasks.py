@@ -1,4 +1,4 @@
-"""Tasks that run beside each other: awaited together, and none left behind."""
+"""Tasks that run concurrently: awaited together, and none left behind."""
 
 from __future__ import annotations
 

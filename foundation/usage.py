@@ -110,8 +110,8 @@ def _import_command(module: str, name: str) -> Any:
     """The command of that name; the whole group when the module has none of that name.
 
     NumPy and SciPy, which it may import, compute with one thread unless the environment says otherwise: their matrices
-    are small here, and two threads, which wait for each other, took twice as long for a calibration (beside load five
-    times).
+    are small here, and two threads, which wait for each other, took twice as long for a calibration (five times
+    under other load).
     """
     # A calibration of 34 positions takes 5.9 to 6.9 s with two threads and 3.4 to 4.1 with one on two idle cores,
     # with two busy programs running 17 to 22 and 3.2 to 3.7. Set before NumPy is imported; a program's own setting

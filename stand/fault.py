@@ -27,7 +27,7 @@ class Readings(Protocol):
         ...
 
     def last_good_ns(self, channel: str) -> int | None:
-        """When the channel was last measured, GOOD or with a value in doubt."""
+        """When the channel was last measured, GOOD or with a suspect value."""
         ...
 
 
@@ -43,7 +43,7 @@ class Fault:
 
     ends_itself: the hold is over when the rule objects no more; else an operator has to reset it. cuts_camera: the
     camera's supply is switched off as well. channels: the two that contradict each other, where a rule compares them;
-    suspect: which of them moved unlike the rest, "" where that cannot be told.
+    suspect: which of them moved unlike the rest, "" where that cannot be determined.
     """
 
     rule: str

@@ -1,7 +1,7 @@
 """Whether the stand has tripped: one latch, which interlock, run, page, status and SECoP ask, and a restart finds.
 
 It belongs to the stand, not to a process or a recording. What only an operator ends is on this computer's disk before
-anything is said of it: two files for each address of what heats and cools, found whatever the folder of the sessions,
+anything is reported: two files for each address of what heats and cools, found whatever the folder of the sessions,
 the configuration's name or the program that asks, and when the disk forgets one of them. A file that cannot be read
 counts as a fault: nobody knows what it held.
 """
@@ -145,7 +145,7 @@ class LatchFile:
                         self.run(function, self._paths, *arguments)
                     except BrokenPipeError:  # the process that touches the disk has ended
                         function(self._paths, *arguments)
-                except Exception as error:  # noqa: BLE001 - whatever it is, it is said
+                except Exception as error:  # noqa: BLE001 - whatever it is, it is reported
                     failure.append(str(error))
 
         thread = threading.Thread(target=work, name="stand-latch", daemon=True)
@@ -185,13 +185,13 @@ def _read_latch(paths: tuple[Path, ...]) -> LatchedFault | None:
             return _make_unreadable_fault(path, error.strerror)
         except ValueError:
             return _make_unreadable_fault(path, "it is damaged")
-    # Nothing was said yet of a fault whose file was not renamed; but it was found.
+    # A fault whose file was not renamed was not reported yet; but it was found.
     begun = next((each for path in paths for each in _find_partial_files(path)), None)
     return None if begun is None else _make_unreadable_fault(begun, "the program that wrote it was killed")
 
 
 def _find_partial_files(path: Path) -> Iterator[Path]:
-    """What a program that was killed in `replace_file` has left beside it."""
+    """Find what a program that was killed in `replace_file` has left next to it."""
     return path.parent.glob(f".{path.name}.*.part")
 
 

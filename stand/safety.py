@@ -105,7 +105,7 @@ class _SafeStateTask:
                 await self._pause()
 
     async def _try(self) -> str:
-        """Why it is not confirmed, "" when it is; a lost answer is worth a second call at once."""
+        """Why it is not confirmed, "" when it is; after a lost answer it is called a second time at once."""
         name = self._actuator.name
         try:
             async with asyncio.timeout(TRY_LIMIT_S):

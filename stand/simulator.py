@@ -149,7 +149,7 @@ class Simulator:
         if not line:
             reason = self._process.stderr.read().strip().splitlines()
             self.stop()
-            ended = f"it said nothing and ended with status {self._process.returncode}"
+            ended = f"it printed nothing and ended with status {self._process.returncode}"
             raise ConfigError(f"the simulator did not start: {reason[-1] if reason else ended}")
         self.addresses: dict[str, str] = json.loads(line)
 

@@ -31,7 +31,7 @@ _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor mus
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """Everything the stand is made of, by name in the order of their ranks; and what its rooms need of that. A relay
+    """Everything the stand is made of, by name in the order of their ranks; and what its packages need of that. A relay
     board and a flap that it lacks have stand-ins."""
 
     every: Mapping[str, Sensor]

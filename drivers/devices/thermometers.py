@@ -50,7 +50,7 @@ class Calibration(Document):
         return indicated_degC + self.offset_K + correction_K
 
     def reading(self, channel: str, indicated_degC: float, now_ns: int, suspicion: str = "") -> Reading:
-        """Of an indication; BAD outside plausible_degC, STALE with a doubt."""
+        """The reading of an indication: BAD outside plausible_degC, STALE when there is a suspicion."""
         T_degC, (low_degC, high_degC) = self.calibrated_degC(indicated_degC), self.plausible_degC
         if not low_degC <= T_degC <= high_degC:
             return bad_reading(channel, "degC", now_ns, f"{T_degC:g} degC is outside {low_degC:g}..{high_degC:g} degC")
@@ -62,7 +62,7 @@ class ThermometerSettings(Calibration):
 
     role: where it is, which rules, reports and recordings ask for: a place is read and recorded as that, whatever the
     sensor's own name; by default the place it is named after, if any. safety: any number of them, each under its own
-    name, that guard the heat beside the air's.
+    name, that guard the heat in addition to the air's.
     """
 
     channel: int = Field(ge=0, le=63)

@@ -1,4 +1,4 @@
-"""USB without a bus: a server beside the fake devices, and the pyusb backend in the daemon that forwards to it.
+"""USB without a bus: a server with the fake devices, and the pyusb backend in the daemon that forwards to it.
 
 One TCP connection, one JSON object per line each way. The daemon's configuration names this module as the flap's
 backend, so that the driver's code is the same for a fake and a real device.

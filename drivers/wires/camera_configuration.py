@@ -174,7 +174,7 @@ def _set_region(name: str, device: GigeDevice, settings: AravisCameraSettings) -
         raise Refused(name, f"{settings.pixel_format} was asked for, the camera gives {given}")
     for feature in words.BINNING:
         _set_whole(name, device, feature, settings.binning, usual=1)
-    for feature in ("OffsetX", "OffsetY"):  # first: a larger size may not fit beside the offset in force
+    for feature in ("OffsetX", "OffsetY"):  # first: a larger size may not fit with the offset in force
         _set_whole(name, device, feature, 0, usual=0)
     width = settings.width_px or _find_largest(device, words.WIDTH_MAX, "Width") - settings.offset_x_px
     height = settings.height_px or _find_largest(device, words.HEIGHT_MAX, "Height") - settings.offset_y_px

@@ -37,4 +37,4 @@ def device_error(name: str, error: AravisError) -> DeviceError:
         return Refused(name, f"{error} (GenICam error {error.code})")
     if error.domain == EVALUATION_ERRORS:
         return Refused(name, f"{error}: a formula of the camera's own description cannot be evaluated")
-    return Unreachable(name, f"{error} ({error.domain} {error.code})")  # the host's network said no
+    return Unreachable(name, f"{error} ({error.domain} {error.code})")  # the host's network refused

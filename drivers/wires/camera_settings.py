@@ -111,7 +111,7 @@ class GigeCameraSettings(AravisCameraSettings):
     """A GigE Vision camera.
 
     address: IP. packet_size: bytes of an IP packet; none lets Aravis find it. packet_delay_ns: pause between two
-    packets; none leaves room for the cameras that the line is shared by. line_Mbps: rate of the line on which its
+    packets; none computes it so that all cameras on the line fit. line_Mbps: rate of the line on which its
     packets reach the host. line_shared_by: so many cameras, itself included; none: all of the stand. heartbeat_s: the
     camera frees itself after so long without us (Aravis asks once a second). resend: lost packets are asked for again.
     """

@@ -96,7 +96,7 @@ def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[flo
             value_degC = device.get_number(place.feature or "")
     except AravisError as error:
         return math.nan, str(error), "wire" if is_silence(error) else "device"
-    if value_degC == 0.0:  # what a faulty firmware shows; a sensor beside its own electronics is warmer
+    if value_degC == 0.0:  # what a faulty firmware shows; a sensor next to its own electronics is warmer
         return math.nan, "the camera shows exactly 0 degC", "device"
     if not place.min_degC <= value_degC <= place.max_degC:
         return math.nan, f"{value_degC:g} degC is outside {place.min_degC:g}..{place.max_degC:g}", "device"

@@ -51,7 +51,7 @@ class LineClient:
         self._hang_ups = HangUps()
         self._flow_bytes = 0  # in the last reply
         self._is_first = False  # nothing was asked over this link before
-        self._is_swallowed = False  # the first request over it, as far as that can be told
+        self._is_swallowed = False  # the first request over it, as far as that can be known
         self._is_asked_again = False  # a read, though its link is gone
         self._free_s = 0.0
 
@@ -163,7 +163,7 @@ class LineClient:
 
     def _clean_link(self, *, is_read: bool) -> ByteLink:
         """The link for the next request, with nothing in it that nobody asked for. What is written into one that its
-        peer has closed is never sent: it is opened anew, for a write only where that is the peer's way."""
+        peer has closed is never sent: it is opened again, for a write only where that is the peer's way."""
         self._wait()
         if (link := self._link) is not None:
             try:

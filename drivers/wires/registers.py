@@ -1,7 +1,7 @@
 """Register map: YAML -> checked points and commands. How they are read, scaled and written: modbus_unit.py.
 
 A point is one quantity at one address (base 0); a word may carry named bits, and a coil or discrete input is a bit
-named by its point. One map drives a unit and can be read beside its manual.
+named by its point. One map drives a unit and can be compared with its manual line by line.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ class InForceCheck(Document):
     @model_validator(mode="after")
     def _one_way(self) -> Self:
         if bool(self.bit) + (self.equals is not None) + bool(self.follows) != 1:
-            raise ValueError("what is in force is told by a bit, by what its point equals, or by the point it follows")
+            raise ValueError("what is in force is shown by a bit, by what its point equals, or by the point it follows")
         return self
 
     def __str__(self) -> str:

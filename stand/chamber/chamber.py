@@ -38,8 +38,8 @@ class ChamberLimits:
 
 @dataclass(frozen=True, slots=True)
 class ChamberOrder:
-    """What the chamber was told, whether the regulator answers now or not: the set-point, and since when heat and cold
-    are permitted (ns)."""
+    """What the chamber was commanded, whether or not the regulator answers now: the set-point, and since when heat and
+    cold are permitted (ns)."""
 
     setpoint_degC: float
     since_ns: int

@@ -1,4 +1,4 @@
-"""`stand check`: is every device of a stand there, the right one, set as it must be, and fit for a night?"""
+"""`stand check`: is every device of a stand there, the right one, set as it must be, and fit for a run?"""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def check(
     """Each device of a stand: its link, identity, settings and a reading; what is wrong, and what to do. Status 1 when
     something has failed.
 
-    Without --moves nothing moves and nothing heats. The record is kept beside the stand's file, and goes with sessions.
+    Without --moves nothing moves and nothing heats. The record is kept next to the stand's file and copied to sessions.
     With --genicam no device is asked: the file is tried on a simulated camera; status 1 when it is refused.
 
     Example: stand check --config my-stand.yaml --moves

@@ -93,9 +93,9 @@ def _find_running_session(directory: Path | None, config: str, *, anywhere: bool
     if list_segments(root):
         raise SessionError(f"{root}: no daemon is running this session")
     others = ", ".join(map(str, list_running_sessions()))
-    is_named_wrongly = directory is not None and not directory.exists()
-    kind = NotFound if is_named_wrongly else SessionError
-    raise kind(
-        f"{root}: {'no such folder' if is_named_wrongly else 'no daemon is running a session there'}"
-        + (f"; there is one elsewhere, name it: {others}" if others else "")
-    )
+    elsewhere = f" One is running elsewhere, name it: {others}." if others else ""
+    if directory is not None and not directory.exists():
+        raise NotFound(f"{root}: no such folder.{elsewhere}" if others else f"{root}: no such folder")
+    looked_in = root if root.is_absolute() or str(root).startswith(".") else f"./{root}"
+    start = "Start one with `stand serve` or `stand run`."
+    raise SessionError(f"No stand is running (looked in {looked_in}). {start}{elsewhere}")

@@ -73,7 +73,7 @@ class BackgroundOutput:
 
 @contextmanager
 def open_background_output() -> Generator[BackgroundOutput]:
-    """An Aside while inside."""
+    """Run the block with a thread that prints; what is printed in it never waits for the terminal."""
     shown = BackgroundOutput()
     try:
         yield shown
@@ -156,7 +156,7 @@ def _format_minutes(duration_s: float) -> str:
 _BETWEEN_PANELS_NS = NS_PER_S // 4
 _BETWEEN_LINES_NS = 60 * NS_PER_S
 _TENTH = 0.1  # of a run in virtual time, whose minutes are none
-_LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the night: terminals are slow
+_LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the run: terminals are slow
 _SHARE = 1e-3
 
 

@@ -1,4 +1,4 @@
-"""The `stand queue` commands: what `stand serve` is to run, one after another, through the nights."""
+"""The `stand queue` commands: what `stand serve` is to run, one after another."""
 
 from __future__ import annotations
 

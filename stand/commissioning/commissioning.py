@@ -144,7 +144,7 @@ _ESTIMATE_AT, _MAXIMUM_AT = 32, 24  # of esterror and maxerror in struct timex, 
 
 
 def _check_disk(config: StandConfig) -> Finding:
-    """Write and flush beside the sessions, as a night does; blocking, up to some seconds."""
+    """Write and flush in the folder of the sessions, as a run does; this blocks for up to some seconds."""
     folder = find_existing(config.recording.directory)
     piece, slowest_s, begin_s = os.urandom(_PIECE_BYTES), 0.0, time.perf_counter()
     try:

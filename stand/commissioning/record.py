@@ -1,4 +1,4 @@
-"""The commissioning record: what `stand check` found, beside the stand's file, as JSON and as HTML for people."""
+"""The commissioning record: what `stand check` found, as JSON and HTML next to the stand's file."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class CommissioningRecord:
         )
 
     def write(self, config: Path) -> tuple[Path, Path]:
-        """Beside the stand's file `config`, the last record replaced; the files. SessionError when refused."""
+        """Replace the record next to the stand's file `config`; return its files. SessionError when refused."""
         data, page = get_record_files(config)
         write_atomically(page, self.html())
         write_atomically(data, json.dumps(self.data(), indent=2, ensure_ascii=False) + "\n")

@@ -25,7 +25,7 @@ class ChamberConfig(Document):
 class HeatBalanceConfig(Document):
     """Heat that the probes do not show: while the regulator heats by half of its power or more, the regulator's value
     and the air must both rise, every two minutes, by rise_share of what the heat given would make of
-    chamber.heat_capacity_Wh_K, and must not fall by 4 K. Good nights: 0.4 at the least, and 1.5 K.
+    chamber.heat_capacity_Wh_K, and must not fall by 4 K. Good sessions: 0.4 at the least, and 1.5 K.
     """
 
     # A dead heater makes none. Of 200 dead heaters on 40 drawn chambers this found each first, within 245 s. Half or
@@ -35,7 +35,7 @@ class HeatBalanceConfig(Document):
 
 class GraniteCrosscheckConfig(Document):
     """The granite inside warms as if the air around it were warmer than a probe shows, by more than limit_K and 0.4 of
-    what lies between that probe and the granite. Good nights: 2.3 K beyond the share. Or, against what was felt within
+    what lies between that probe and the granite. Good sessions: 2.3 K beyond the share. Or, against the estimate of
     the last quarter of an hour, by change_K and the same share of what has changed.
     """
 
@@ -47,7 +47,7 @@ class GraniteCrosscheckConfig(Document):
 
 class CameraCrosscheckConfig(Document):
     """As the granite, by the camera's own temperature: its excess over the air is learned when it has been on for
-    settle_s, and must not grow. A camera that works more when it gives frames needs a wider limit_K. Good nights:
+    settle_s, and must not grow. A camera that works more when it gives frames needs a wider limit_K. Good sessions:
     2.6 K beyond half of what lies between air and camera.
     """
 
@@ -59,7 +59,7 @@ class CameraCrosscheckConfig(Document):
 class SteadyStatePowerConfig(Document):
     """An output far from what the chamber has needed. Once the regulator has held its set-point within 2 K for
     settle_s, with the flap shut and the compressor as it is, means of 5 min may differ by limit_percent from those at
-    set-points up to 3 K away, learned apart with and without the compressor. Good nights: 10.6 %.
+    set-points up to 3 K away, learned apart with and without the compressor. Good sessions: 10.6 %.
     """
 
     settle_s: float = Field(default=1800.0, ge=300, le=14_400)

@@ -1,4 +1,4 @@
-"""The record that `stand check` keeps beside a stand's file, as those who run the stand need it: is it of this file?"""
+"""Reads the record that `stand check` keeps next to a stand's file: does it belong to this version of the file?"""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def compute_digest(text: str) -> str:
 
 
 def load_check_record(config: Path) -> CheckRecord | None:
-    """The record beside the file, None when there is none; ConfigError when it cannot be read or is none."""
+    """The record next to the file, None when there is none; ConfigError when it cannot be read or is none."""
     path, _ = get_record_files(config)
     if not path.is_file():
         return None

@@ -36,7 +36,7 @@ class SensorsConfig(Document):
     """Thermometers against each other. A difference of the air's from the regulator's probe, or from a safety
     thermometer, above warn_K for warn_after_s is a warning; one of air and probe above trip_K for trip_after_s is a
     fault; a ramp at full power makes up to 5 K, and 3 K for 170 s. A temperature that moves by more than jump_K beyond
-    its trend and its step within a few polls is in doubt: a contact, a cable, not a temperature. drift_K: a change of
+    its trend and its step within a few polls is suspect: a contact, a cable, not a temperature. drift_K: a change of
     the difference of two in the same air, at a set-point that is held again, is a warning.
     """
 
@@ -87,7 +87,7 @@ class GuardConfig(Document):
     channels: limits for what any device measures, by its channel, as `lab.pressure`.
     added: settings of rules that other packages add, by their names. safe_limit_s: how long, at the end of a run, it is
     tried to have every actuator confirm that it is safe.
-    heat_max_Wh_per_h: within any hour; good nights took up to 900.
+    heat_max_Wh_per_h: within any hour; good sessions took up to 900.
     """
 
     period_s: float = Field(default=1.0, gt=0, le=10)

@@ -14,10 +14,10 @@ _README = """\
 In this order:
 
     stand check --config stand.yaml                 # does each device answer, and is it the right one?
-    stand plan recipe.yaml --config stand.yaml      # what a night takes; nothing moves
+    stand plan recipe.yaml --config stand.yaml      # what a run takes; nothing moves
     stand run recipe.yaml --config stand.yaml --virtual-time        # a rehearsal in a simulated laboratory
     stand serve stand.yaml --port 8080              # the stand for days; its page is http://127.0.0.1:8080/
-    stand run recipe.yaml --config stand.yaml       # one night, from the command line
+    stand run recipe.yaml --config stand.yaml       # one run, from the command line
 
 `stand config schema --out schema` writes the JSON Schemas that their first lines name: an editor checks them by these.
 """
@@ -89,7 +89,7 @@ def _substitute(text: str, pattern: str, by: str) -> str:
 
 
 def _read_installed(folder: Folder, name: str) -> str:
-    """Of an installed file; its schema is named beside it, so that the folder may go to any computer."""
+    """The text of an installed file. Its schema is named relative to it, so that the folder may go to any computer."""
     return _SCHEMA.sub(r"$schema=schema/\1", find_packaged(folder, name).read_text("utf-8"))
 
 

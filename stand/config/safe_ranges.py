@@ -46,7 +46,9 @@ SAFE_RANGES = (
     SafeRange(
         "guard.panel_change_grace_s", " s", "a set-point changed by hand would be followed for so long", high=120
     ),
-    SafeRange("guard.flap_open_s", " s", "an open flap lets the chamber's air at the optics and the room", high=3600),
+    SafeRange(
+        "guard.flap_open_s", " s", "an open flap lets the chamber's air at the optics and the laboratory", high=3600
+    ),
     SafeRange("guard.flap_capture_s", " s", "a capture that hangs would leave the flap open for so long", high=7200),
     SafeRange("guard.disk_low_s", " s", "it would be heated for so long without recording frames", high=1800),
     SafeRange(

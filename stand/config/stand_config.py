@@ -90,7 +90,8 @@ class LimitsConfig(Document):
 class CompressorConfig(Document):
     """The refrigeration compressor's own protection and when it is wanted (outputs of the regulator, %).
 
-    state_file: where it is remembered when the compressor last ran; by default compressor.json beside the sessions.
+    state_file: where it is remembered when the compressor last ran; by default compressor.json in the folder of the
+    sessions.
     """
 
     # Cycled with these times the compressor's 600 W swing the air by 0.4 to 1 K, so it runs on while the heater trims.
@@ -401,7 +402,7 @@ def _find_role_faults(thermometers: Mapping[str, ThermometerSettings]) -> Iterat
 
 
 def load_config(path: Path) -> StandConfig:
-    """The configuration file, checked. Register maps and optics that lie beside it, and GenICam files, are named by
+    """The configuration file, checked. Register maps and optics in its folder, and GenICam files, are named by
     their whole path."""
     config = load_document(path, StandConfig)
     simulation = config.simulation and config.simulation.model_copy(
@@ -431,7 +432,7 @@ def _resolve_camera_files(path: Path, camera: SimulatedCamera) -> SimulatedCamer
 
 
 def _resolve_path(path: Path, name: str) -> str:
-    """The whole path of the file of this name beside the configuration at `path`; the name where there is none."""
+    """The whole path of the file of this name next to the configuration at `path`; the name where there is none."""
     file = path.parent / name
     try:
         is_another = file.is_file() and not (Path(name).is_file() and file.samefile(name))
@@ -442,7 +443,7 @@ def _resolve_path(path: Path, name: str) -> str:
 
 def find_packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "") -> Path:
     """The file `name` of the installed configs/`folder`, or `name` itself when that is a path that exists; first of all
-    beside the file that names it, under `key`.
+    next to the file that names it, under `key`.
 
     Raises ConfigError that lists what there is.
     """

@@ -1,4 +1,4 @@
-"""How the chamber, and the camera in it, follow a new set-point: a small model, and how recorded nights teach it.
+"""How the chamber, and the camera in it, follow a new set-point: a small model, and its fit to recorded sessions.
 
 After dead_s the air goes towards the set-point with
 

@@ -19,7 +19,7 @@ from thermostand.stand.gate import HELD, RELEASED
 
 # Round numbers; nothing was measured.
 _REMEMBERED = 9  # the last measurements of a kind of work count
-_LEAST_SEEN = 3  # steps that are done, before anything is said of how sure the end is
+_LEAST_SEEN = 3  # steps that are done, before the uncertainty of the end is stated
 _LEAST_WITHIN_S = 60.0  # nobody plans by less; round number, nothing was measured
 _LEAST_SHARE = 0.5  # of what is left must be of known kinds of work; round number, nothing was measured
 
@@ -31,8 +31,8 @@ class Eta:
     a single delay, such as a pause that was not announced, changes nothing. Steps before the running one are never
     waited for.
 
-    Of a run that is resumed after an interruption, `done` are the ids of steps that are done, `soaked_s` what others
-    have earned of what is stated, by their ids. `after_s`: what follows the last step, the way back to the laboratory's
+    Of a run that is resumed after an interruption, `done` are the ids of steps that are done, `soaked_s` how long
+    others have soaked so far, by their ids. `after_s`: what follows the last step, the way back to the laboratory's
     temperature.
     """
 
@@ -43,7 +43,7 @@ class Eta:
         soaked_s: Mapping[str, float] = MappingProxyType({}),
         after_s: float = 0.0,
     ) -> None:
-        self._expected_s = {step.planned.step_id: step.duration_s for step in steps}  # with what it has earned
+        self._expected_s = {step.planned.step_id: step.duration_s for step in steps}  # with the soak time so far
         self._steps = [_subtract_soaked(step, soaked_s.get(step.planned.step_id, 0.0)) for step in steps]
         self._waiting = {step.planned.index: step for step in self._steps if step.planned.step_id not in done}
         self._first = min(self._waiting, default=0)

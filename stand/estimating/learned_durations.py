@@ -1,4 +1,4 @@
-"""What the last nights taught about durations: learned from the sessions in a folder, kept in a file beside them."""
+"""Durations learned from the last sessions in a folder, kept in a file next to them."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _read_session(path: Path, stand: str) -> _SessionDurations | None:
         session = Session.open(path)
         if read_stand_name(session.attachment("config.yaml") or "") == stand:
             return _SessionDurations(path.name, session.steps(), extract_ramps(session))
-    except Exception:  # noqa: BLE001 - it was written by anybody; what one session teaches is not worth a run
+    except Exception:  # noqa: BLE001 - anybody may have written it, and one unreadable session must not cost a run
         pass
     return None
 

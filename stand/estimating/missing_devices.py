@@ -31,4 +31,4 @@ def _iterate_missing(config: StandConfig) -> Iterator[Absence]:
             "independent air sensor", "a regulator's probe and an air thermometer that are wrong alike are not found"
         )
     if "laboratory" not in config.sensors:
-        yield Absence("thermometer in the laboratory", "a night ends at ending.ambient_degC")
+        yield Absence("thermometer in the laboratory", "a run ends at ending.ambient_degC")

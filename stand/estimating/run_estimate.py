@@ -1,4 +1,4 @@
-"""What a whole run will take, by what the stand's last nights have taught, and whether the disk has room for it."""
+"""What a whole run will take, learned from the stand's last sessions, and whether the disk has space for it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def find_existing(directory: Path) -> Path:
 
 
 def explain_small_disk(directory: Path, steps: Iterable[PricedStep], config: StandConfig) -> str:
-    """What is wrong with the disk's room for a run that would stop in the middle of the night; "" when it will do."""
+    """Why the disk has too little space for a run, which would stop half-way; "" when there is enough."""
     free_bytes = shutil.disk_usage(find_existing(directory)).free
     plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
     if free_bytes / 1e9 >= plan_GB + least_GB:

@@ -1,7 +1,7 @@
 """One check of every temperature that a model or a rule uses: outside its range, jumped, noisy, or stuck.
 
 Each channel is judged against itself: how fast it can move (the lag of what it measures), the steps in which it is
-shown, and the channel that it follows. What is doubted is recorded as STALE with cause "doubt"; it stays a reading, for
+shown, and the channel that it follows. What is suspect is recorded as STALE with cause "doubt"; it stays a reading, for
 whether heat may go on is the guard's business. No reading shows that it is wrong before it jumps, so that one which is
 wrong from the begin is found only where physics says so: a camera that is at rest is warmer than its air.
 """
@@ -52,7 +52,7 @@ _TREND_S = (4.0, 20.0)  # between the readings of which a trend is made
 _TREND_K = 4.0  # that a trend may promise: full heat makes up to 0.5 K/s in the smallest of the drawn chambers
 # Half of 1 K is still 25 times what good sessions have; twice would not find a noise of 1 K.
 _NOISE_POLLS, _NOISE_K = 12, 1.0
-"""The median of second differences: 0.02 K in good nights, 1.65 K with a noise of 1 K (standard deviation)."""
+"""The median of second differences: 0.02 K in good sessions, 1.65 K with a noise of 1 K (standard deviation)."""
 _TOGETHER_S = 15.0  # what moves within this, on other devices, moved with it
 _BACK_S = 1800.0  # for so long a channel must be as far from the one that it follows as it was before it jumped
 _STILL_K = 2.0  # air that stays within this is at rest, as far as a camera notices
@@ -60,10 +60,10 @@ _STILL_K = 2.0  # air that stays within this is at rest, as far as a camera noti
 _REST_LAGS = 3.0  # after so many lags in air at rest a camera is at rest, too
 _REST_K, _OWN_REST_LAGS = 1.0, 2.0
 """A camera that stayed within so much for so many of its configured lags has warmed up: the lag is a guess, and one of
-a hundred drawn nights had a camera three times as slow, still warming up in air at rest."""
+a hundred drawn sessions had a camera three times as slow, still warming up in air at rest."""
 _STEPS_BEHIND, _SLOWER, _FINE_STEP_K, _YOUNG_LAGS = 5.0, 3.0, 0.2, 10.0
 """Steps of a display that a camera must have gone before it counts as stuck, with up to three times its configured lag.
-One coarser than 0.2 K needs more, in proportion, while it may still warm up: of 260 drawn nights one had a camera in
+One coarser than 0.2 K needs more, in proportion, while it may still warm up: of 260 drawn sessions one had a camera in
 steps of 0.5 K that stood still for 35 min while its own heat and air that fell by 18 K balanced each other."""
 # Half of it leaves 0.5 K above the 2.5 K of radiation and granite.
 _EXCESS_K = 6.0  # from rest to rest: radiation and the granite make up to 2.5 K of it between -10 and 60 degC
@@ -84,7 +84,7 @@ class ChannelModel:
 
 @dataclass(slots=True)
 class _Suspicion:
-    """Why, since when; how far it jumped in all, K, and how far it was from what it follows before."""
+    """Why a channel is suspect, since when; how far it jumped in all, K, and how far from what it follows it was."""
 
     fault: Fault
     time_ns: int
@@ -94,12 +94,12 @@ class _Suspicion:
 
     @property
     def rule(self) -> str:
-        """Its name."""
+        """The name of the rule."""
         return self.fault.rule
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The reason in words."""
         return self.fault.text
 
 
@@ -171,7 +171,7 @@ class ChannelCheck:
     def _judge(
         self, channel: str, value: float, time_ns: int, fine_K: float, *, is_poll: bool
     ) -> list[tuple[str, _Suspicion]]:
-        """What begins to be doubted by one more reading."""
+        """List the suspicions that begin with one more reading."""
         nature, seen = self._natures[channel], self._seen.get(channel)
         if seen is not None and time_ns <= seen.time_ns:
             return []
@@ -212,7 +212,7 @@ class ChannelCheck:
             seen.rest_degC, seen.rest_ns = followed_degC, time_ns
 
     def _get_trusted_degC(self, channel: str) -> float:
-        """The last value of another channel, NaN when there is none, or that one is doubted itself."""
+        """The last value of another channel, NaN when there is none, or that one is suspect itself."""
         other = self._seen.get(channel)
         return math.nan if other is None or other.doubted is not None else other.value
 
@@ -352,7 +352,7 @@ class ChannelCheck:
         return None
 
     def _report(self, began: list[tuple[str, _Suspicion]], module: str, channels: list[str], now_ns: int) -> None:
-        """One event for what jumps at one instant, one for each that is doubted for another reason."""
+        """One event for what jumps at one instant, one for each that is suspect for another reason."""
         jumped = [(channel, suspect) for channel, suspect in began if suspect.rule == SENSOR_JUMPED]
         for channel, doubted in began:
             if doubted.rule != SENSOR_JUMPED:
@@ -403,7 +403,7 @@ class ChannelCheck:
 
 
 def _compute_share(time_s: float, lag_s: float) -> float:
-    """Of a step that a body of that lag has followed after that time."""
+    """The share of a step that a body of that lag has followed after that time."""
     return 1.0 - math.exp(-time_s / lag_s)
 
 
@@ -418,7 +418,7 @@ def _compute_own_heat_K(seen: _ChannelState, nature: ChannelModel, from_ns: int,
 
 
 def _get_step_K(seen: _ChannelState) -> float:
-    """Of its display, 0 while it is not known; one coarser than 2 K does not widen anything further."""
+    """The step of its display, K; 0 while it is not known; one coarser than 2 K does not widen anything further."""
     return 0.0 if math.isinf(seen.step_K) else min(seen.step_K, 2.0)
 
 

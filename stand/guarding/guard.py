@@ -41,8 +41,8 @@ class Guard:
 
     met: device errors that steps have met, whose watches are among `watches`.
 
-    latch: gets each fault before anything else is done or said of it; it waits for a disk for a quarter of a second at
-    most.
+    latch: gets each fault before anything else is done or reported about it; it waits for a disk for a quarter of a
+    second at most.
 
     A look that comes late (the process was stopped, the host suspended, the loop held up) is an event, and permits then
     wait for a GOOD reading of each of `vital`, the channels that heat depends on, taken since. What is too old

@@ -11,7 +11,7 @@ from thermostand.stand.config.chamber_section import ChamberConfig, HeatBalanceC
 from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.plausibility import make_stateful_rule
 
-NO_HEAT_RESPONSE = guard_rule("heat_not_felt", "the regulator heats hard, and a probe does not show it")
+NO_HEAT_RESPONSE = guard_rule("no_heat_response", "the regulator heats hard, and a probe does not show it")
 TOO_MUCH_HEAT = guard_rule("too_much_heat", "more heat was given within an hour than the chamber ever needs")
 _LONGEST_LOOK_S = 60.0  # between two looks; what was given in a longer gap is not known
 _BEFORE_S = 30.0  # a stretch of heat begins: from here on a fall counts
@@ -21,7 +21,7 @@ HARD_PERCENT = 50.0
 # 60 s are 2.4 lags of the heater: 9 % are still to come. Half of it would leave 30 %.
 _WINDOW_S, _SETTLE_S = 120.0, 60.0  # over which it must rise, once the heater's own lag of 25 s is over
 # Half of it is 0.5 K above what good sessions do.
-_FALL_K = 4.0  # from its highest; good nights fall by 1.5 K, when a ramp passes a capture's open flap
+_FALL_K = 4.0  # from its highest; good sessions fall by 1.5 K, when a ramp passes a capture's open flap
 
 
 def compute_heat_percent(readings: Readings, regulator: str, permit: str) -> float:

@@ -63,8 +63,8 @@ def limit_temperature(channel: str, max_degC: float, *, cuts_camera: bool = Fals
 
 
 def require_fresh_reading(channel: str, stale_after_s: float) -> Rule:
-    """`channel` was never read, was last GOOD more than `stale_after_s` ago, or the device itself has said for the
-    second poll that it has no measurement: sensor break, converter error, out of range.
+    """`channel` was never read, was last GOOD more than `stale_after_s` ago, or the device itself has reported for
+    the second poll that it has no measurement: sensor break, converter error, out of range.
 
     A poll or two may be STALE, or BAD by the wire: a reply that is late or garbled is asked for again.
     """

@@ -110,7 +110,7 @@ def list_vital_channels(config: StandConfig) -> tuple[str, ...]:
 
 def make_watches(config: StandConfig, announced: Announcements) -> tuple[Watch, ...]:
     """Every rule with the configured limits. Abort where the stand's temperature is not known or not controlled: that
-    ends a night. Hold where an operator can put it right and the night is worth continuing."""
+    ends the run. Hold where an operator can put it right and the run can then continue."""
     seen = make_sensor_history(config)
     return (
         *_watch_temperatures(config),
@@ -204,7 +204,7 @@ def _watch_sensors(config: StandConfig, seen: SensorHistory) -> tuple[Watch, ...
 
 def _watch_drifts(config: StandConfig) -> tuple[Watch, ...]:
     """The air's thermometer against others in that air: `safety` ones, and the regulator's probe, which shows 0.1 K and
-    sits beside the heater, where it has one. Gradients in the air are others while the regulator is stopped, and while
+    sits next to the heater, where it has one. Gradients in the air are others while the regulator is stopped, and while
     the compressor runs against the heater: those are states of their own."""
     same, limit_K = (FLAP, "relays.camera_power", RUNNING, COMPRESSOR), config.guard.sensors.drift_K
     others = dict.fromkeys(list_safety_thermometers(config), limit_K)
@@ -326,7 +326,7 @@ def list_cold_parts(config: StandConfig) -> tuple[str, ...]:
 
 
 def _watch_dew(config: StandConfig) -> tuple[Watch, ...]:
-    """Water on lens or target ends a night's work without a sign; making safe closes the flap."""
+    """Water on lens or target ends the work of a run without a sign; making safe closes the flap."""
     dew = config.dew
     if dew is None:
         return ()

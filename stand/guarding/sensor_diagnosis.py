@@ -30,7 +30,7 @@ _HARD_PERCENT, _GIVEN_K, _RESPONSE_SHARE = 50.0, 1.0, 0.15
 
 @dataclass(frozen=True, slots=True)
 class Suspicion:
-    """suspect: the channel, "" when it cannot be told. by: what speaks against it."""
+    """suspect: the channel, "" when it cannot be determined. by: what speaks against it."""
 
     suspect: str = ""
     by: tuple[str, ...] = ()
@@ -38,9 +38,9 @@ class Suspicion:
     def words(self, pair: tuple[str, str]) -> str:
         """As the end of a sentence that names both."""
         if not self.suspect:
-            return f"; whether {pair[0]} or {pair[1]} is wrong cannot be told from what else is measured"
+            return f"; whether {pair[0]} or {pair[1]} is wrong cannot be determined from what else is measured"
         if not self.by:
-            return f"; {self.suspect} is the one in doubt, the other is not"
+            return f"; {self.suspect} is the suspect one, the other is not"
         return f"; {self.suspect} moved unlike the rest ({', '.join(self.by)})"
 
 
@@ -226,7 +226,7 @@ class SensorHistory:
 
 def name_suspect(rule: Rule, pair: tuple[str, str], witnesses: SensorHistory, *, compares: bool = True) -> Rule:
     """A rule that compares two channels, whose fault names both and says which one moved unlike the rest. One that does
-    not compare them, but judges by the first, says it only when it can be told."""
+    not compare them, but judges by the first, says it only when it can be determined."""
 
     def told(readings: Readings, now_ns: int) -> Fault | None:
         witnesses.note(readings, now_ns)

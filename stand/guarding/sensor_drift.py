@@ -24,7 +24,7 @@ Key = tuple[float, ...]
 @dataclass(frozen=True, slots=True)
 class _HeldSetPoint:
     """The set-point and what else is as it was, since when; the sums over the readings of the means under way, of
-    channel minus other and minus each third; what each such state had at first (K, ns), and what is to be said."""
+    channel minus other and minus each third; what each such state had at first (K, ns), and what is to be reported."""
 
     key: Key
     since_ns: int

@@ -12,7 +12,7 @@ from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.heat_balance import compute_heat_percent
 from thermostand.stand.guarding.plausibility import make_stateful_rule
 
-FIRST_HEAT = guard_rule("first_heat", "the first heat is not felt where it is given")
+FIRST_HEAT = guard_rule("first_heat", "the temperature does not rise where the first heat is given")
 _HEATS_PERCENT = 40.0  # that no chamber can take without getting warmer
 _LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds
 

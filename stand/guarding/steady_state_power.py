@@ -1,4 +1,4 @@
-"""The output that a chamber at rest needs at its set-point, learned in the night: far from it, something is wrong."""
+"""The output that a chamber at rest needs at its set-point, learned during the run: far from it, something is wrong."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OUTPUT_NOT_AS_NEEDED = guard_rule(
 _FLAP_OPEN_ABOVE = 0.05  # as in interlocks.py
 _BAND_K, _MEAN_S = 2.0, 300.0  # at its set-point; the cycles of a relay's output are a minute
 # In proportion, set-points twice as far apart differ by 20 %, close to the limit of 25.
-_NEAR_K = 3.0  # a set-point so near needs the same within 10 % in good nights
+_NEAR_K = 3.0  # a set-point so near needs the same within 10 % in good sessions
 _LEARNING = 0.25  # share of a new mean; the first is taken whole
 
 

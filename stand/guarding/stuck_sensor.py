@@ -74,7 +74,7 @@ class Constant:
 
 def forbid_stuck_while_other_moves(channel: str, other: str) -> Rule:
     """`channel` has been exactly constant for at least a minute, in which `other`, in the same air, went 1 K
-    beyond its scatter; one that is in doubt goes nowhere.
+    beyond its scatter; one that is suspect counts as not moving.
 
     The regulator shows 0.1 K and holds that for an hour, while its output goes from one end to the other to do so:
     neither a constant value nor an output that moves proves a stuck probe, a second sensor does.

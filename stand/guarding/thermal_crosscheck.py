@@ -25,7 +25,7 @@ _COVERAGE = 3.0  # with 1 K of noise in the granite its rate says nothing of the
 _GRANITE_WINDOW_S, _CAMERA_WINDOW_S = 60.0, 120.0  # of a rate: the camera shows its temperature in steps of 0.25 K
 _GRANITE_SHARE, _CAMERA_SHARE = 0.4, 0.5
 """What a lag that is a third off, and drawn chambers differ by as much, makes of how far a body is from the air."""
-_CHANGE_S = 900.0  # of what was felt lately: a failure shows within minutes, what is learned of the lag takes longer
+_CHANGE_S = 900.0  # of the estimate lately: a failure shows within minutes, what is learned of the lag takes longer
 _STILL_AIR_K = 3.0  # air that went so far moves every camera that is not stuck
 _GAP_S = 60.0  # between two readings; after a longer one the window begins again
 
@@ -41,8 +41,8 @@ class CrosscheckSample:
 
 @dataclass(frozen=True, slots=True)
 class AirEstimate:
-    """Over one window: the air as the body feels it, as the probe shows it, and the body itself, degC; what the probe
-    has risen, K. uncertain_K: of the air that is felt, by the scatter of the body, with k = 3."""
+    """Over one window: the air as estimated by the body, as the probe shows it, and the body itself, degC; what the
+    probe has risen, K. uncertain_K: of the estimated air, by the scatter of the body, with k = 3."""
 
     air_degC: float
     probe_degC: float
@@ -51,7 +51,7 @@ class AirEstimate:
     uncertain_K: float = 0.0
 
     def excess_K(self, limit_K: float, share: float) -> float:
-        """How far the air that is felt is above all that is allowed: limit_K, and that share of how far probe and body
+        """How far the estimated air is above all that is allowed: limit_K, and that share of how far probe and body
         are apart; below 0 all is well. A probe that rises fast has a lag of its own, and is neither stuck nor
         outside."""
         apart_K = abs(self.probe_degC - self.body_degC)
@@ -80,7 +80,7 @@ def estimate_air(looks: Sequence[CrosscheckSample], window_s: float, lag_s: floa
 def update_window(
     looks: tuple[CrosscheckSample, ...], readings: Readings, body: str, probe: str, window_s: float
 ) -> tuple[CrosscheckSample, ...]:
-    """The window with what is new, if that is a measurement which is not in doubt; a new one after a gap."""
+    """The window with what is new, if that is a measurement which is not suspect; a new one after a gap."""
     reading, probe_degC = readings.latest(body), get_value(readings, probe)
     if reading is None or math.isnan(reading.value) or reading.cause == "doubt" or math.isnan(probe_degC):
         return looks
@@ -95,7 +95,7 @@ def update_window(
 
 @dataclass(frozen=True, slots=True)
 class GraniteState:
-    """The window; by how much the air that is felt was lately above the probe, and the probe above the granite, K: None
+    """The window; by how much the estimated air was lately above the probe, and the probe above the granite, K: None
     before the first window is full."""
 
     looks: tuple[CrosscheckSample, ...] = ()
@@ -112,7 +112,7 @@ class GraniteState:
         return GraniteState(looks, lately_K, self.lately_apart_K + share * (apart_K - self.lately_apart_K))
 
     def compute_change_K(self, found: AirEstimate, limits: GraniteCrosscheckConfig) -> float:
-        """How far the air that is felt has gone from the probe lately, beyond what is allowed. The error of the lag has
+        """How far the estimated air has gone from the probe lately, beyond what is allowed. The error of the lag has
         been there before, and so does not count."""
         if self.lately_K is None:
             return -math.inf

@@ -32,7 +32,7 @@ _LEAST_MARKERS = 4  # shift, turn and scale are four
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Of change per minute, with its standard uncertainty; NaN when nothing can be said."""
+    """A rate of change per minute, with its standard uncertainty; NaN when it cannot be estimated."""
 
     per_min: float = math.nan
     uncertainty: float = math.nan

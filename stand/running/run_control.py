@@ -78,7 +78,7 @@ def resolve_steps(
     plan: Sequence[PlannedStep], from_index: int, steps: Sequence[WrittenStep]
 ) -> Iterator[tuple[Step | ConfigError, float | None]]:
     """Each of the steps that are to follow the first `from_index` of the plan, or what is wrong with it; and the
-    chamber's set-point there, None while it is stopped. Frames that are not said to be at one are at that."""
+    chamber's set-point there, None while it is stopped. Frames for which none is stated are at that one."""
     found = Situation()
     for planned in plan[:from_index]:
         found = planned.step.situation_after(found)

@@ -19,7 +19,7 @@ DECIDES = decision_process.decide_next_visit  # for a process of its own, which 
 
 
 class Reported(NamedTuple):
-    """unexplained: what no temperature explains, a sentence each. results: the table beside the paper's, and where the
+    """unexplained: what no temperature explains, a sentence each. results: the table next to the paper's, and where the
     files are."""
 
     unexplained: tuple[str, ...]

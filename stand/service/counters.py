@@ -1,4 +1,4 @@
-"""What a daemon knows across restarts, beside its sessions: `daemon.json` with the counters.
+"""What a daemon knows across restarts, in the folder of its sessions: `daemon.json` with the counters.
 
 Written in the background, by the process that touches the disk: no loop waits for it.
 """
@@ -104,7 +104,7 @@ class StoredCounters(BaseModel):
 
 
 def load_counters(directory: Path) -> tuple[StoredCounters, str]:
-    """What a daemon before has left, and what is wrong with it, as a sentence: a damaged file is kept beside it, and
+    """What a daemon before has left, and what is wrong with it, as a sentence: a damaged file is kept next to it, and
     the counters begin again. Blocking."""
     path = directory / NAME
     try:

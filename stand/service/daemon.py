@@ -95,7 +95,7 @@ class Daemon(Host):
         self.has_admitted_run = False  # from the moment it is let in until it has gone
         self._is_draining = False  # until the queue knows how its run has ended
         self._keep = keep
-        self._recorded_whole = recorded  # is told of complete runs with frames
+        self._recorded_whole = recorded  # is notified of complete runs with frames
         self._status = systemd.StatusNotice()
         self._leaving, self._wake = asyncio.Event(), asyncio.Event()
         self._is_given_up = False  # an operator does not want to wait for the confirmation that the stand is safe

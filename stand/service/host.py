@@ -54,7 +54,7 @@ class Host:
         return tuple(dict.fromkeys((*self._assembly.stand.motions.names, *self.manual_tasks.values())))
 
     def get_state_fields(self) -> dict[str, object]:
-        """The fields of the state that are known of whoever has the stand open."""
+        """The fields of the state that are known whichever program has the stand open."""
         ordered, by_hand = self._assembly.stand.chamber.ordered, None
         if ordered is not None and not self.has_run:  # as it was ordered: the regulator may not answer
             by_hand = HeatByHand(**asdict(ordered), cut_ns=self._assembly.stand.chamber.permits.ended_ns)

@@ -112,7 +112,7 @@ class IdleLog:
         self._cut_off_recording()
         self._day = day
         self._now = _Recording(recorder, tap, disk, asyncio.create_task(recorder.run()))
-        publish_identities(self._assembly, tap.give)  # a run that is still completed has said them
+        publish_identities(self._assembly, tap.give)  # a run that is still completed has published them
         self._removal = asyncio.create_task(self._remove_old())
         return recorder
 

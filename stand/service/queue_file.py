@@ -1,6 +1,6 @@
 """The file of a queue of runs, `queue.json` in the recording directory, and its locks.
 
-The file is replaced as a whole, and then what it was before is put beside it as `queue.json.last`: two that are the
+The file is replaced as a whole, and then what it was before is put next to it as `queue.json.last`: two that are the
 same are a change that the disk has lost. `.queue.lock` is locked
 (flock) while it is read or changed, `.queue.worker` as long as a process runs the queue: a run that is marked as
 running when none does was interrupted.
@@ -32,7 +32,9 @@ file is written at each change. What was run stays in its session."""
 _KIND = "queue"
 _LOCK_NAME = ".queue.lock"
 _WORKER_NAME = ".queue.worker"
-_REMEDY = f"{LAST_NAME} beside it is the queue before its last change: rename it to {QUEUE_NAME}, or move both away"
+_REMEDY = (
+    f"{LAST_NAME} in the same folder is the queue before its last change: rename it to {QUEUE_NAME}, or move both away"
+)
 
 
 class QueueState(StrEnum):
@@ -197,7 +199,7 @@ def _load(directory: Path) -> Queue:
         data = path.read_bytes()
         if last.is_file() and last.read_bytes() == data:
             raise SessionError(
-                f"{path}: the disk has lost its last change; look at what is queued, then remove {LAST_NAME} beside it"
+                f"{path}: the disk has lost its last change; look at what is queued, then remove {LAST_NAME} next to it"
             )
         return Queue.model_validate_json(unseal(_KIND, data))
     except FileNotFoundError:

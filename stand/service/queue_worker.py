@@ -150,7 +150,7 @@ class _QueuedRun:
         await self._write(note_session, session)
 
     def _note_step(self) -> None:
-        """Written beside the run."""
+        """Write the step to the queue's file while the run goes on."""
         if not self._has_stepped:
             self._has_stepped = True
             self._notes.append(asyncio.create_task(self._write(note_step)))

@@ -1,6 +1,6 @@
 """The queue of a daemon: what may be queued, and what is in it.
 
-A night is checked when it is queued: recipe, limits, devices that answer, room on the disk. All that
+A run is checked when it is queued: recipe, limits, devices that answer, space on the disk. All that
 touches the disk is done in a thread of its own, which keeps no daemon from leaving.
 """
 
@@ -206,14 +206,14 @@ class RunQueue:
             raise Conflict(str(error)) from error
 
     def _estimate(self, order: Order) -> PlanEstimate:
-        """What the run will take; Conflict when the disk has no room for it."""
+        """What the run will take; Conflict when the disk has no space for it."""
         estimate = estimate_plan(tuple(order.recipe.plan()), order.config, self.directory)
         if lack := explain_small_disk(self.directory, estimate.steps, order.config):
             raise Conflict(f"{self.directory}: {lack}")
         return estimate
 
     def _check_wires(self, order: Order) -> None:
-        """What does not answer now, and what else would end the night at its beginning."""
+        """What does not answer now, and what else would end the run at its beginning."""
         assembly = self._open_stand.assembly
         lacks = [
             f"{channel} is not read: {reading.reason}"

@@ -41,7 +41,7 @@ from thermostand.stand.service.run_queue import RunQueue
 from thermostand.stand.serving.alerts import send_alerts
 from thermostand.stand.serving.preview_process import MODULE
 
-# The reports of runs that have come to their end, by a process of its own at the lowest priority: a night can be read
+# The reports of runs that have come to their end, by a process of its own at the lowest priority: a session can be read
 # in the morning, and nothing that guards or records waits for it.
 
 _REPORT = "report"

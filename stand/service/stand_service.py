@@ -201,7 +201,7 @@ class StandService(Served):
 
     @command("/run/pause")
     def pause(self, who: Who, given: PauseRequest) -> str:
-        """Hold the run before its next action; the chamber keeps its set-point, a dwell what it has earned.
+        """Hold the run before its next action; soak time so far is kept, and the chamber holds its set-point.
 
         Moves under way are completed, and the answer lists them; `stand stop` stops it. The flap is shut within a
         minute. After guard.pause_limit_h the stand is made safe and held.
@@ -267,10 +267,10 @@ class StandService(Served):
     async def submit(self, who: Who, given: SubmitRequest) -> QueuedRun:
         """Check a run and queue it as it is now. Later edits of its file change nothing.
 
-        Recipe, limits, wires and the room on the disk are checked. With the key of an earlier run: that one, 409 when
+        Recipe, limits, wires and the space on the disk are checked. With the key of an earlier run: that one, 409 when
         its request was another.
 
-        Example: stand submit night.yaml --key monday
+        Example: stand submit overnight --key monday
         """
         orders, order = self._require_queue(), RunRequest.model_validate(given.model_dump(exclude={"key"}))
         entry = await orders.submit(who, order, given.key)
@@ -377,7 +377,7 @@ class StandService(Served):
 
 
 def describe_pause(when: When) -> str:
-    """What is said of a pause."""
+    """The message about a pause."""
     begins = "pauses when the step under way is done" if when == "step" else "paused"
     return f"{begins}; `stand continue` ends the pause"
 

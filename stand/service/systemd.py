@@ -21,7 +21,7 @@ def notify_systemd(*lines: str) -> None:
 
 
 class StatusNotice:
-    """What is done now, told when it changes."""
+    """Notifies systemd of what is done now, when it changes."""
 
     def __init__(self) -> None:
         self._last_text = ""

@@ -91,7 +91,7 @@ class DaemonInstance:
 
     def tell(self, entry: DaemonEntry) -> None:
         """Say this from now on."""
-        with self._lock, suppress(OSError):  # what was said before stays
+        with self._lock, suppress(OSError):  # the entry before stays
             self._entry = entry
             if self._file is not None:
                 self._write_entry(self._path)

@@ -1,4 +1,4 @@
-"""How whoever has a stand open answers its clients: commands, stream, page and SECoP, as the stand's file has it."""
+"""Answers clients of the program that has the stand open: commands, stream, page, SECoP, as the stand's file has it."""
 
 from __future__ import annotations
 

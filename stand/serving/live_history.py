@@ -177,7 +177,7 @@ class History:
             ring.resize(self._capacity)
         self._rows: dict[str, int] = {}
         self._units: dict[str, str] = {}
-        self._infos: deque[Mark] = deque(maxlen=MOST_MARKS)  # so many of what is only worth knowing
+        self._infos: deque[Mark] = deque(maxlen=MOST_MARKS)  # so many of level info
         self._warned: deque[Mark] = deque(maxlen=MOST_MARKS)  # and so many of what is more
         self._steps: deque[Mark] = deque(maxlen=MOST_MARKS)
         self._references: deque[Mark] = deque(maxlen=MOST_MARKS)

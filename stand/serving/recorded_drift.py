@@ -1,4 +1,4 @@
-"""How the markers moved over a recorded night, from a part of its frames: for a look at it, or at two together.
+"""How the markers moved over a recorded session, from a part of its frames: for a look at it, or at two together.
 A fit with all of them is `compensate`'s. It takes seconds: in a process of its own, at the lowest priority.
 """
 
@@ -66,7 +66,7 @@ def find_run_references(path: Path | str) -> tuple[RecalledReference, ...]:
 
 def compute_session_drift(path: Path | str, target_text: str) -> SessionDrift:
     """The drift of a session's first camera against its first reference frame (without one: its first frame), in at
-    most MOST_FRAMES frames spread over the night. Its own target is taken, else `target_text`. SessionError when the
+    most MOST_FRAMES frames spread over the session. Its own target is taken, else `target_text`. SessionError when the
     session cannot be read."""
     session = Session.open(path)
     table = session.frames_table()

@@ -1,5 +1,5 @@
 """The history of recorded sessions: of one that is looked at, of two that are compared, and of the last week after a
-restart. It reads disks: in a process of its own, never beside the guard.
+restart. It reads disks: in a process of its own, never in that of the guard.
 """
 
 from __future__ import annotations

@@ -23,10 +23,10 @@ def obeys(session: Path) -> bool:
 DAEMON = """
 import asyncio, sys
 from pathlib import Path
-from tests.stand.fake_service import ADesk, served
+from tests.stand.fake_service import FakeService, serve_fake
 
 async def run():
-    async with served(ADesk(), Path(sys.argv[1])):
+    async with serve_fake(FakeService(), Path(sys.argv[1])):
         print("ready", flush=True)
         await asyncio.Event().wait()
 

@@ -216,7 +216,7 @@ async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
     async with a_page(night.chromium, night.port, "sessions") as page:
         for name in ("monday", "tuesday"):
             await page.get_by_label(f"Choose {name}").check()
-        await page.get_by_role("button", name="Compare these two nights").click()
+        await page.get_by_role("button", name="Compare these two sessions").click()
         curves = page.get_by_role("img", name="Temperatures of monday and tuesday")
         await curves.locator("canvas").wait_for()
         assert await curves.evaluate("(place) => place.querySelector('canvas').width") > 400

@@ -254,7 +254,7 @@ order = load_order("warm-up", "simulated")
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(20):
-    number = queue.append(Path(sys.argv[1]), queue.entry_of(order, "simulated", 1)).id
+    number = queue.append(Path(sys.argv[1]), queue.make_entry(order, "simulated", 1)).id
     queue.move(Path(sys.argv[1]), number, 1)
 """
 
@@ -292,7 +292,7 @@ def test_a_damaged_file_is_named_left_alone_and_can_be_put_right(tmp_path: Path,
     damaged = damage(path.read_bytes())
     path.write_bytes(damaged)
     for attempt in (lambda: add(tmp_path), lambda: queue.load_queue(tmp_path), lambda: queue.take(tmp_path, 1)):
-        with pytest.raises(SessionError, match=r"queue\.json: is damaged .*queue\.json\.last beside it is") as caught:
+        with pytest.raises(SessionError, match=r"queue\.json: is damaged .*queue\.json\.last in the same") as caught:
             attempt()
         assert "\n" not in str(caught.value)
     assert path.read_bytes() == damaged
@@ -311,7 +311,7 @@ def test_a_queue_that_is_gone_or_as_it_was_before_its_last_change_is_none_to_go_
             attempt()
     path.unlink()
     for attempt in (lambda: add(tmp_path), lambda: queue.load_queue(tmp_path)):
-        with pytest.raises(SessionError, match=r"is missing; queue\.json\.last beside it is .*: rename it"):
+        with pytest.raises(SessionError, match=r"is missing; queue\.json\.last in the same folder is .*: rename it"):
             attempt()
     last.rename(path)
     assert states(tmp_path) == [(1, "waiting"), (2, "waiting")]

@@ -66,7 +66,7 @@ HAZARDS = (
         ),
         (
             "over_temperature", "sensors_disagree", "air_warmer_than_shown", "too_much_heat",
-            "heat_not_felt", "output_not_as_needed", "sensor_bad", "sensor_missing", "sensor_stale", "sensor_stuck",
+            "no_heat_response", "output_not_as_needed", "sensor_bad", "sensor_missing", "sensor_stale", "sensor_stuck",
             "sensor_drifts", "sensor_implausible", "sensor_outside", "sensor_noisy", "sensor_jumped",
         ),
         _CUT_OUT,
@@ -129,7 +129,7 @@ HAZARDS = (
         "the regulator asks for more; heat arrives elsewhere",
         "damage",
         ("heater.cut_out",),
-        ("first_heat", "heat_not_felt"),
+        ("first_heat", "no_heat_response"),
         _CUT_OUT,
         ("system/test_guard_wire.test_a_fault_trips_its_rule_in_time_and_the_stand_is_safe",),
         (Trial("heater.cut_out", True, 22.0, 60.0, 900.0, 50.0),),

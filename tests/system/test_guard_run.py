@@ -122,7 +122,7 @@ def once_warm(action: Callable[[], object]) -> Callable[[Hub], None]:
         ),
         ("thermometers.no_fault_bits", True, "sensor_stale", "was last good 20.0 s ago, limit 15.0 s"),
         ("thermometers.silent", True, "sensor_bad", "thermometers.air is BAD"),
-        ("heater.cut_out", True, "heat_not_felt", "degC while the regulator heats by"),
+        ("heater.cut_out", True, "no_heat_response", "degC while the regulator heats by"),
         ("heater.welded_share", 0.9, "warming_while_off", "degC with the heater off"),
     ],
 )

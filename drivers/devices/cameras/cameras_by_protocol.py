@@ -1,4 +1,4 @@
-"""The camera protocols: each is one file `camera_<protocol>.py` beside this one, with `Settings` and `Camera`.
+"""The camera protocols: each is one file `camera_<protocol>.py` next to this one, with `Settings` and `Camera`.
 
 `Settings` is a subclass of CameraSettings with `protocol: Literal["<protocol>"] = "<protocol>"`, and `Camera(name,
 settings, clock)` is a protocols.Camera.

@@ -96,7 +96,7 @@ class JulaboLanguage(ChamberLanguage):
         self._say()
 
     def _say(self) -> None:
-        """What is told by the queries that this unit answers, and what is left open by the others."""
+        """Log what the queries that this unit answers report, and what the others leave open."""
         texts = [f"{query} tells {text}" for query, text in _QUERIES.items() if query in self._asked]
         self.in_force_by = ", ".join((*texts, "status tells whether it is operated by hand"))
         unknown = [text for query, text in _QUERIES.items() if query not in self._asked]

@@ -36,7 +36,7 @@ class _Module(Protocol):
 
 
 def _load_languages() -> dict[str, _Module]:
-    """The languages: a file of each, beside this one, has `Language` and `Settings`, whose protocol is its name."""
+    """Import the languages. Each is a file next to this one, named for its protocol, with `Language` and `Settings`."""
     names = sorted(module.name for module in pkgutil.iter_modules(thermostand.drivers.devices.chambers.__path__))
     modules = {
         name.removeprefix("chamber_"): importlib.import_module(f"thermostand.drivers.devices.chambers.{name}")

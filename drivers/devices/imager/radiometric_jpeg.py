@@ -162,7 +162,7 @@ def _counts(record: bytes) -> NDArray[np.uint16]:
 
 
 def _from_png(body: bytes, width: int, height: int) -> NDArray[np.uint16]:
-    if struct.unpack_from(">II", body, 16) != (width, height):  # before anybody makes room for it
+    if struct.unpack_from(">II", body, 16) != (width, height):  # before memory is allocated for it
         raise NotRadiometric("its PNG is of another size than it says")
     import cv2  # half a second that other devices need not wait for
 

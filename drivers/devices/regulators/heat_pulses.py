@@ -1,7 +1,7 @@
 """Heat by time proportioning: in each cycle a relay, or the SSR behind it, is on for the output's share of it.
 
 Every pulse is a timed-on of the relay board, so that the board itself ends it: whatever stops this program ends the
-heat within one cycle, beside the heater's enable relay in series, which has a time of its own.
+heat within one cycle. The heater's enable relay in series has a time limit of its own besides.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class PulsesSettings(Document):
 
 
 def compute_pulse_s(percent: float, carry_s: float, settings: PulsesSettings) -> tuple[float, float]:
-    """How long the relay is on in the coming cycle (cycle_s: all of it), and what is then owed (s, less than 0 when too
-    much was given): what was rounded, or left out, of the output's share."""
+    """How long the relay is on in the coming cycle (cycle_s: all of it), and what remains to be given (s, less than 0
+    when too much was given): what was rounded, or left out, of the output's share."""
     wanted_s = percent / 100 * settings.cycle_s + carry_s
     given_s = round(min(settings.cycle_s, max(0.0, wanted_s)) / _STEP_S) * _STEP_S
     if given_s < settings.min_on_s:
@@ -72,7 +72,7 @@ class HeatPulses:
         """Each pulse ends by itself."""
 
     async def test_dead_man(self) -> None:
-        """The board's timer is tested with the relay `heater_enable`, beside this one on the same board."""
+        """The board's timer is tested with the relay `heater_enable`, which is on the same board."""
 
     async def give(self, percent: float, *, at_once: bool = False) -> None:
         """The output from now on: of the next cycle, or at_once, with a cycle that begins now. DeviceFault when the

@@ -31,7 +31,7 @@ _OVERHEAD_bytes = 66  # Ethernet with preamble and gap, IP, UDP
 
 
 class Switch:
-    """rate_MBps: of the line out, 1e6 bytes/s. lost: packets that found no room."""
+    """rate_MBps: of the line out, 1e6 bytes/s. lost: packets for which a buffer was full."""
 
     def __init__(self, rate_MBps: float, buffer_bytes: int = BUFFER_bytes) -> None:
         self.lost = 0

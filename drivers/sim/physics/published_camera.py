@@ -53,7 +53,7 @@ class _Network:
 
 class PublishedCamera:
     """One camera of a preset. drawn: its number, None for the middle of each range. seed: of what does not repeat, so
-    that another night of the same camera is another one.
+    that another session of the same camera differs.
 
     `step` is for Plant.on_step: it takes the air and the supply of the step that begins.
     """
@@ -128,7 +128,7 @@ class PublishedCamera:
 
     @property
     def far_air_degC(self) -> float | None:
-        """What a thermometer of the air far from the camera reads; None when it hangs beside it."""
+        """What a thermometer of the air far from the camera reads; None when it hangs next to the camera."""
         if "far_air" not in self._effects:
             return None
         return REFERENCE_degC + self._far_share * (self._far.value - REFERENCE_degC)

@@ -2,7 +2,7 @@
 SIMSERV), Julabo.
 
 Sources: ESPEC P300/SCP-220 and CTS interface manuals, Voetsch ASCII-2 transcripts. Each answers text; how it is framed
-is said at its class. The control is proportional over 3 K. None has a watchdog of its communications.
+stands at its class. The control is proportional over 3 K. None has a watchdog of its communications.
 """
 
 from __future__ import annotations

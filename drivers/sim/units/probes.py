@@ -19,7 +19,7 @@ _NOISE_K, _NOISE_PERCENT = 0.002, 0.05
 
 
 class FakeProbe:
-    """Beside the stand, in the laboratory's air. humidity_percent: of that air. Faults: silent; failed (it shows stars
+    """A probe outside the chamber. humidity_percent: of the laboratory's air. Faults: silent; failed (it shows stars
     or dashes instead of a number); fahrenheit (somebody has changed its unit); serial_number; echo (it repeats what it
     was asked, as in full duplex)."""
 

@@ -155,7 +155,7 @@ RANGES_DEGC = {
 
 
 class FakeThermometers(RtdModule):
-    """Faults beside those of any module: type_codes (the range of each channel, changed over the bus too).
+    """Faults in addition to those of any module: type_codes (the range of each channel, changed over the bus too).
     late_fault_bit: the fault bits are those of the poll before. no_fault_bits: they are refused. name: identity as in
     FC 0x46."""
 

@@ -174,7 +174,7 @@ def _parse_speed(text: str) -> float | None:
 
 
 def _check_new(out: Path, session: Path) -> None:
-    """ConfigError when `out` cannot become a folder beside `session`."""
+    """ConfigError when `out` cannot become a folder outside `session`."""
     if out.resolve().is_relative_to(session.resolve()) and out.resolve() != session.resolve():
         raise ConfigError(f"{out}: is inside the session; choose a place outside of it")
     if out.exists():
@@ -232,7 +232,7 @@ def export_session(
 ) -> None:
     """A session as PNG files with their temperatures, and its telemetry as tables; or as one MCAP file.
 
-    Example: stand session export sessions/20260101T180000Z-thermal-cycle --out night --format parquet
+    Example: stand session export sessions/20260101T180000Z-thermal-cycle --out data --format parquet
     """
     _check_new(out, directory)
     with _open_session(directory, incomplete) as session, show_late_progress("export", 1.0) as report:

@@ -42,7 +42,7 @@ def list_sessions(
     not_archived: Annotated[bool, typer.Option("--not-archived", help="Only those without a copy elsewhere.")] = False,
 ) -> None:
     """The sessions in a folder, the oldest first: recipe, start, duration, frames, size, how the
-    run ended, whether the files are sound, and what people said of them.
+    run ended, whether the files are sound, and the operators' notes.
 
     Example: stand session list /data/sessions --tag paper
     """

@@ -53,7 +53,7 @@ def _format_instant(time_ns: int | None, utc: UtcOffsets) -> str | None:
 
 
 def _format_row(label: str, text: str) -> Iterator[str]:
-    """A label and its text, wrapped beside it; a path stays whole, to be copied."""
+    """Yield the lines of a label with its text to the right, wrapped; a path stays whole, to be copied."""
     wrapper = textwrap.TextWrapper(
         WIDTH, f"{label:<{_LABEL}}", " " * _LABEL, break_long_words=False, break_on_hyphens=False
     )
@@ -92,7 +92,7 @@ def _format_facts(found: Overview, utc: UtcOffsets) -> Iterator[str]:
 
 
 def _format_notes(entry: ListedSession) -> Iterator[str]:
-    """What people said of the session, and where a copy is."""
+    """Yield the tags and notes of the session, and where its copies are."""
     if entry.tags:
         yield from _format_row("tags", ", ".join(entry.tags))
     for text in _limit([f"{format_local(note.time_ns)} {note.by}: {note.text}" for note in entry.notes]):

@@ -6,7 +6,7 @@ Rows are read from the top; the first that fits decides:
     the capture under way has all its frames                 Complete, unless it is taken again for lost ones
     its next frame is not due yet                            Sleep
     something holds the run                                  Wait
-    the soak under way has earned its time                   Complete
+    the soak under way has lasted its time                   Complete
     the set-up is disturbed; a warm-up was interrupted       RestartCold
     the set-up is disturbed                                  Restore
     a soak since the last set-point owes time                Earn
@@ -38,7 +38,7 @@ CREDITED_WITHIN_K = 1.0
 # the same any more.
 # Round number; nothing was measured.
 RETAKE_AFTER_S = 60.0
-# A disk that loses frames each time must not hold the night for good.
+# A disk that loses frames each time must not hold the run for good.
 MOST_RETAKES_FOR_LOST_FRAMES = 3
 
 
@@ -210,7 +210,7 @@ def _find_preparation(state: RunState, around: Surroundings, planned: PlannedSte
     if state.is_setup_invalid:
         if again := find_cold_start_steps(state):
             return RestartCold(again)
-        # A soak depends on what it has earned itself as on those before it.
+        # A soak depends on its own soak time so far as on the soaks before it.
         return Restore(set_up.after(planned) if isinstance(planned.step, AnySoak) else set_up)
     if owing := next((soak for soak in set_up.soaks if state.remaining_ns(soak)), None):
         return ContinueSoak(owing)
@@ -279,7 +279,7 @@ def _find_last_switch(steps: Plan, *, on: bool) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class SoakCredit:
-    """What the soaks that were begun are worth after a disturbance; `lost` are soaked again. text: why, "" when
+    """Which soaks that were begun still count after a disturbance; `lost` are soaked again. text: why, "" when
     there was nothing to lose."""
 
     text: str = ""
@@ -287,7 +287,7 @@ class SoakCredit:
 
 
 def credit_soaks(state: RunState, set_up: SetUp, around: Surroundings) -> SoakCredit:
-    """Soaks since the last set-point keep what they have earned only if the chamber is in its band, and the camera was
+    """Soaks since the last set-point keep their soak time so far only if the chamber is in its band, and the camera was
     on."""
     begun = tuple(soak for soak in set_up.soaks if soak.step_id in state.done or state.soaked_ns.get(soak.step_id, 0))
     if not begun or set_up.chamber_degC is None:

@@ -1,9 +1,9 @@
 """What a gap may have done to the camera.
 
-It may have been off while nobody watched it; in doubt it was. And its own temperature minus that of the air near it,
-once a set-point has settled, may be another one: what the camera gives off and how the air takes it. A gap in which
-that has changed (another mount, a fan, another camera board) parts a night in two: before and after are not of one
-equilibrium.
+It may have been off while nobody watched it; without evidence it counts as off. And its own temperature minus that of
+the air near it, once a set-point has settled, may be another one: what the camera gives off and how the air takes it.
+A gap in which that has changed (another mount, a fan, another camera board) parts a session in two: before and after
+are not of one equilibrium.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class SettlingWatch:
         self._clock = clock
         self._target = target
         self._worker = WorkerThread("settling", clock)
-        # Time in s and degC, one after the other: as tuples of objects they were most of what a night's memory grew by.
+        # Time in s and degC, one after the other: as tuples of objects they were most of the memory that a run took.
         self._readings = {name: array("d") for name in (CHAMBER, CAMERA)}
         self._digit_K = 0.0
         self._looks: list[Float] = []

@@ -34,7 +34,7 @@ class SoakRunner:
         changes: the event of the plan's next change. DeviceFault of the regulator when it ends unsettled and the recipe
         wants that to hold the run; it then owes everything again."""
         self._settling.restart()
-        reported_s = 0.0  # until when it goes on at least, as was said
+        reported_s = 0.0  # until when it goes on at least, as was reported
         while (soak := self._state.step(step_id)) and (remaining_ns := self._state.remaining_ns(soak)):
             if self._is_interrupted() or not isinstance(soak.step, AnySoak):
                 return
@@ -70,7 +70,7 @@ class SoakRunner:
         return (UNSETTLED,)
 
     async def _save_progress(self, soak: PlannedStep, now_ns: int, soaked_ns: int, *, is_over: bool) -> None:
-        """What it has earned; and when it is over, whether the chamber was in its band at last."""
+        """Record the soak time so far; and when it is over, whether the chamber was in its band at last."""
         step, step_id = soak.step, soak.step_id
         is_settled = True
         if is_over and isinstance(step, AnySoak) and self._measure_missing_s(step):
@@ -92,7 +92,7 @@ class SoakRunner:
         return bool(self._gate.reasons) or self._state.is_setup_invalid
 
     def _compute_judgement_ns(self, step: AnySoak, soaked_ns: int) -> int:
-        """Until a soak that has earned so much may end."""
+        """How long until a soak with so much soak time may end, ns."""
         if not isinstance(step, Soak):
             return _JOURNAL_NS
         short_ns = to_ns(step.duration_s) - soaked_ns

@@ -3,7 +3,7 @@ journal (recording/reading/format_lines.py).
 
     Begun        the run, its plan and the texts it was made of; the first line and no other
     StepChanged  a step was started, or is done
-    Soaked        what a soak has earned so far
+    Soaked        soak time so far
     Held         a reason to wait appeared or went
     Gap          nothing ran between two instants
     Again        steps that were done are to be done again
@@ -64,7 +64,7 @@ class StepChanged:
 
 @dataclass(frozen=True, slots=True)
 class Soaked:
-    """A soak has earned `soaked_s`; also after its end, when it has to be earned again. ended: once it has, with the
+    """A soak has lasted `soaked_s`; also after its end, when it has to be repeated. ended: once it has, with the
     chamber in its band or without."""
 
     time_ns: int

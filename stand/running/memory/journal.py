@@ -84,8 +84,8 @@ class Journal:
 
     @classmethod
     def open(cls, directory: Path) -> tuple[Journal, list[JournalEntry]]:
-        """The journal of a session and the entries of its sound lines, none when not even the first was written; a torn
-        tail is cut off. Of a journal with damaged lines a copy is kept, and its `damage` says so.
+        """The journal of a session and the entries of its sound lines, none when not even the first was written; a
+        partial last line is cut off. Of a journal with damaged lines a copy is kept, and its `damage` says so.
 
         SessionError when there is none, or when a daemon is running this session.
         """
@@ -236,7 +236,7 @@ def _lock_and_read(fd: int, path: Path) -> tuple[list[JournalEntry], bytes, byte
 
 
 def _keep_damaged_copy(path: Path, data: bytes, last_damaged: int) -> Path:
-    """A copy of a journal with damaged lines, durably beside it; one that has these lines already will do."""
+    """A copy of a journal with damaged lines, durably next to it; one that has these lines already will do."""
     damaged = b"\n".join(data.split(b"\n")[:last_damaged])
 
     def is_it(copy: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The whole memory of a run, as a value: what is done, earned and recorded, and what has been undone since.
+"""The whole memory of a run, as a value: what is done, soaked and recorded, and what has been undone since.
 
 It is folded from the run's entries (fold.py); what to do next is read from it
 (stand/running/executing/actions.py).
@@ -81,7 +81,7 @@ class SetUp:
     """What steps have set up, so that it can be brought about again: of each kind only the last counts.
 
     chamber_degC: the set-point, None when the chamber is stopped. positions: axis -> mm or deg. soaks: the soaks since
-    the last set-point, worth something only as long as the chamber stays at it. others: the last step of each kind that
+    the last set-point, which count only as long as the chamber stays at it. others: the last step of each kind that
     another package adds. Before any step the camera is on and the flap closed."""
 
     chamber_degC: float | None = None
@@ -130,9 +130,9 @@ class RunState:
 
     done, begun, skipped: ids of steps; what is skipped counts as done. under_way: the id of the step that was begun by
     this daemon and is not done, "" when there is none. earned_ns: of soaks, by id; one that is done and not listed has
-    earned all of it. soaked: by the same, how they ended, where that is said. frames: by the id of a capture that is
-    not done. taken_again: by the same, how often because the disk had lost some of them. changes: of the plan, as they
-    came.
+    lasted its whole time. soaked: by the same, how they ended, where that is recorded. frames: by the id of a capture
+    that is not done. taken_again: by the same, how often because the disk had lost some of them. changes: of the
+    plan, as they came.
 
     disturbances: how often something may have undone the set-up (an interlock, a camera that was off, a daemon's death,
     a warm-up that is restarted), of which so many are `restored`. is_cold: the camera was or may have been off, and the
@@ -229,7 +229,7 @@ class RunState:
         return next((planned for planned in self.plan if planned.step_id == step_id), None)
 
     def remaining_ns(self, soak: PlannedStep) -> int:
-        """What the soak has not earned yet of its longest time; nothing when it has ended, or is left out."""
+        """How much of its longest time the soak has still to go; nothing when it has ended, or is left out."""
         if soak.step_id in self.soaked or soak.step_id in self.skipped:
             return 0
         duration_ns = get_duration_ns(soak)

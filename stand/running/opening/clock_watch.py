@@ -1,4 +1,4 @@
-"""Beside the pollers in real time: reports when the host's system clock departs from the stand's, and a suspend."""
+"""Reports, in real time, when the host's system clock departs from the stand's, and when the host was suspended."""
 
 from __future__ import annotations
 

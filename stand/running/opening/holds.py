@@ -19,7 +19,7 @@ from thermostand.stand.stand import Stand
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
 SHUT_AFTER_S = 48.0
 _LOOK_S = 5.0  # who was on the way when the gate closed may open it later
-_CLEARED_WITHIN_S = 1800.0  # by whoever works with a virtual run: some 30 s of real time
+_CLEARED_WITHIN_S = 1800.0  # by the person who works with a virtual run: some 30 s of real time
 _ENDLESS_LOOK_S = 30.0
 _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be worn
 

@@ -1,1 +1,1 @@
-"""The HTTP interface of a stand: a thread of its own beside the control loop."""
+"""The HTTP interface of a stand: a thread of its own, apart from the control loop."""

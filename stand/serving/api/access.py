@@ -139,7 +139,7 @@ class Access:
         return code
 
     def log_in(self, code: str) -> str:
-        """The cookie of who has the code, which is worth nothing from now on; "" when it is none."""
+        """The cookie of who has the code, which is void from now on; "" when it is none."""
         login = self._codes.pop(_hash(code), None)
         if login is None or not self._is_valid(login):
             return ""
@@ -163,7 +163,7 @@ class Access:
         return Who(name="", how="loopback", read_only=self.trusts_loopback == "read-only")
 
     def admit(self, scope: Scope) -> Who:
-        """Who asks and may, whoever is asked for whatever; Denied."""
+        """Return who asks, if the client may ask anything at all; Denied otherwise."""
         self.check(scope)
         who = self.identify(scope)
         if who is None and not is_exempt_from_token(scope["path"]):

@@ -36,7 +36,7 @@ _FRESH_S = 0.3  # so long one who asks for the state waits for a new one
 # The thread is never waited for: what it has not taken of so many items is dropped for viewers, never for the
 # recording.
 _QUEUE = 20_000  # items, which are some MB; the thread takes them four times a second at the least
-_PLAN_AGE_S = 5.0  # what a plan has earned and expects changes slowly; the begin or end of a step is shown at once
+_PLAN_AGE_S = 5.0  # soak times and expected ends change slowly; the begin or end of a step is shown at once
 _STOPPED_S = 0.1  # between two stops, from any client: a flood must not fill the recording
 COMMAND_LIMIT_S = 5.0  # a device is given its own time-outs
 _FIRST_NS = 1_767_225_600_000_000_000  # 2026-01-01

@@ -1,5 +1,5 @@
 """Those who want something else than STOP, in uvicorn's protocols: the thread at the doors (stop_thread.py) hands them
-over when they have said what they want.
+over once their request is known.
 
 At most MOST_CLIENTS are in at once, as a script that leaks connections must not take the files that others need; the
 next one waits at the door. Each leaves with its answer, but for viewers. Who does not read is not kept for ever.

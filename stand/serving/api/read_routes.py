@@ -92,7 +92,7 @@ def _list_run_metrics(state: StandState) -> Iterator[_Metric]:
 
 
 def _list_interface_metrics(snapshot: StateSnapshot, drops: int, viewers: int) -> Iterator[_Metric]:
-    yield "snapshot_age_seconds", "gauge", "Since the control loop last said how it is.", [({}, snapshot.age_s)]
+    yield "snapshot_age_seconds", "gauge", "Since the control loop last reported its state.", [({}, snapshot.age_s)]
     yield "interface_drops_total", "counter", "Items that the interface was too slow for.", [({}, float(drops))]
     yield "viewers", "gauge", "Clients that follow the stream.", [({}, float(viewers))]
 
@@ -172,7 +172,7 @@ def make_read_routes(bridge: Bridge, stream: Stream, access: Access, url: str) -
 
     @router.get("/api/v1/plan", response_model=list[PlanStep])
     async def plan() -> Response:
-        """The plan in force, with what is done and earned; empty when nothing is run."""
+        """The plan in force, with what is done and soaked so far; empty when nothing is run."""
         steps = await bridge.plan()
         return _make_response("[" + ",".join(step.model_dump_json() for step in steps) + "]")
 

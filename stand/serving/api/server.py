@@ -102,7 +102,7 @@ def preload() -> None:
 
 
 def check_ports(interface: Interface) -> None:
-    """ConfigError when nobody can listen at one of its ports: a port in use is said before a device is opened."""
+    """ConfigError when nobody can listen at one of its ports: a port in use is reported before a device is opened."""
     for door in _open_tcp_sockets(interface).values():
         door.close()
 

@@ -3,7 +3,7 @@
 It accepts at the TCP port, at the Unix socket, and at another one for the command line's STOP. What a connection says
 first is looked at and left in the kernel: a request for STOP is answered here, without its body; every other connection
 is handed over as it is, once its head is there and there is room for it. Whatever the others do meanwhile, a STOP waits
-for this thread's turn only, which is a few system calls. Who says nothing makes room for the next.
+for this thread's turn only, which is a few system calls. A silent client makes room for the next.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def is_readable(listening: socket.socket) -> bool:
 
 
 class _Client:
-    """One connection: it has said nothing that is understood, or waits for `answer`, or `has_answer` and is listened to
+    """One connection: it has sent nothing that is understood, or waits for `answer`, or `has_answer` and is listened to
     no more; until `until_s`."""
 
     def __init__(self, door: ListenerKind, connection: socket.socket, now_s: float) -> None:
@@ -78,7 +78,7 @@ class _Client:
         self.has_answer = False
 
     def may_leave(self, now_s: float) -> bool:
-        """Whether it makes room for another; a STOP is said as a whole, by all but those who drip."""
+        """Whether it makes room for another; a STOP arrives as a whole, except from clients that drip."""
         has_time = not self.has_spoken and now_s < self.came_s + _MAY_SPEAK_S
         return self.has_answer or not (self.answer is not None or self.waits or has_time)
 
@@ -102,7 +102,7 @@ class _Client:
 
 class StopThread:
     """From `start` to `end`; `listen`, `start` and `end` are for any thread. hand_over: is given who wants something
-    else, and says whether there is room. `stopping` as that of the bridge; `failed` is called with what should not
+    else, and returns whether there is room. `stopping` as that of the bridge; `failed` is called with what should not
     happen."""
 
     def __init__(self, stopping: Stopping, access: Access, failed: Callable[[Exception], None]) -> None:
@@ -162,7 +162,7 @@ class StopThread:
             for spare in self._spares:
                 os.close(spare)
             for door, listening in self._doors.values():
-                if door == "stop" or not self.has_failed:  # whoever accepts there now has STOP, too
+                if door == "stop" or not self.has_failed:  # the process that accepts there now has STOP, too
                     listening.close()
             self._epoll.close()
             with self._lock:
@@ -177,7 +177,7 @@ class StopThread:
             self._serve_ready()
 
     def _serve_ready(self) -> None:
-        """Everybody who has said something, then those who are new."""
+        """Serve every client that has sent something, then those who are new."""
         wait_s = _LOOK_S if self._clients else None
         events = self._epoll.poll(_REST_S if any(each.waits for each in self._clients.values()) else wait_s)
         for number, _ in events:
@@ -224,7 +224,7 @@ class StopThread:
             connection.setblocking(False)
             client = self._clients[connection.fileno()] = _Client(door, connection, time.monotonic())
             self._epoll.register(connection, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET)
-            self._receive(client)  # it has mostly said something by now
+            self._receive(client)  # it has mostly sent something by now
 
     def _has_room(self, door: ListenerKind) -> bool:
         clients = [each for each in self._clients.values() if each.door == door and not each.waits]
@@ -243,7 +243,7 @@ class StopThread:
         if silent:
             with suppress(OSError):
                 silent[0].connection.send(
-                    make_last_refusal(503, "the daemon has no descriptor left, and you said nothing")
+                    make_last_refusal(503, "the daemon has no descriptor left, and you sent nothing")
                 )
             self._drop(silent[0])
         elif self._spares:

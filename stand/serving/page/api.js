@@ -42,7 +42,7 @@ export function called(name, button, text = (title) => title, label = null) {
   return button;
 }
 
-// Orders the command of that name with what its argument takes; `said`: what it is called here. `place` gets the
+// Orders the command of that name with what its argument takes; `said`: its label here. `place` gets the
 // outcome; returns the answer, or null when it was refused.
 export async function order(place, name, given = {}, said = name) {
   tell(place, `${said} …`);

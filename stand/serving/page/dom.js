@@ -76,7 +76,7 @@ export function bytes(count) {
 
 export const words = (name) => name.replace("setpoint", "set-point").replace(/_degC$/, " °C").replace(/_deg$/, ", °").replace(/_(mm|s|K|px|Wh)$/, ", $1").replaceAll("_", " ");
 
-// Resume, while a trip is not reset: why not, beside the button.
+// Resume, while a trip is not reset: why not, next to the button.
 export function hold_resumes(place, note, { fault }) {
   for (const button of place.querySelectorAll("button[data-resume]")) button.disabled = Boolean(fault);
   say(note, fault && place.querySelector("button[data-resume]") ? "The stand has tripped: look at it and reset it, above; then a run can be resumed." : "");
@@ -84,7 +84,7 @@ export function hold_resumes(place, note, { fault }) {
 
 export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-// Asks beside the button that was pressed; never in a window of its own, which could lie over STOP.
+// Asks next to the button that was pressed; never in a window of its own, which could lie over STOP.
 export function ask(place, question, yes, act) {
   place.querySelector(".ask")?.remove();
   const box = h("div", { class: "ask", role: "group", "aria-label": question });

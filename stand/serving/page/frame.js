@@ -42,7 +42,7 @@ export class FramePanel {
     const answer = await fetch(`/api/v1/frame.jpg${query}`);
     if (!answer.ok || this.closed) return;
     const picture = await createImageBitmap(await answer.blob());
-    this.picture?.close(); // pictures are not left to the collector: a night has 7,200 of them
+    this.picture?.close(); // pictures are not left to the collector: a session has 7,200 of them
     this.picture = picture;
     this.time_ns = frame.time_ns;
     this.frame = frame;

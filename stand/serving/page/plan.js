@@ -1,4 +1,4 @@
-// The plan as a time line and as a list: what is done, what is earned, what is to come and when.
+// The plan as a time line and as a list: what is done, how long soaks have lasted, what is to come and when.
 import { called, commands, get, order, tell } from "./api.js";
 import { ask, axes_of, clock, css, day_clock, duration, fill, h, number, say, seconds, words } from "./dom.js";
 import { PlanEdit, step_schema } from "./plan_edit.js";

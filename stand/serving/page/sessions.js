@@ -1,4 +1,4 @@
-// Recorded sessions, their reports, and two nights one over the other.
+// Recorded sessions, their reports, and two sessions one over the other.
 import { called, get, order, tell } from "./api.js";
 import { look_of } from "./channels.js";
 import { swatch } from "./now.js";
@@ -7,7 +7,7 @@ import uPlot from "./uPlot.js";
 
 const MOST_ROWS = 200;
 const RESUMABLE = ["interrupted", "stopped", "tripped", "failed"]; // recording/reading/run_status.py
-// A dash says which night: here colours alone tell air from camera, and must be far apart.
+// A dash shows which session: here colours alone distinguish air from camera, and must be far apart.
 const COMPARED = [["thermometers.air", "--c-granite"], ["camera.temperature", "--c-camera"]];
 
 export class Sessions {
@@ -86,7 +86,7 @@ export class Sessions {
 
   choose() {
     this.compare_button.disabled = !this.chosen.length;
-    this.compare_button.textContent = this.chosen.length === 2 ? "Compare these two nights" : "Show this night";
+    this.compare_button.textContent = this.chosen.length === 2 ? "Compare these two sessions" : "Show this session";
   }
 
   async compare() {
@@ -101,7 +101,7 @@ export class Sessions {
     for (const [index, name] of names.entries()) this.find_drift(name, index, names);
   }
 
-  // Markers of a whole night take longer than its curves: they are shown when they are there.
+  // Markers of a whole session take longer than its curves: they are shown when they are there.
   async find_drift(name, index, names) {
     const place = this.drift_answers[index];
     try {
@@ -124,7 +124,7 @@ export class Sessions {
     const drift = h("div", { class: "curve", role: "img", "aria-label": `Mean drift of ${names.join(" and ")}` });
     this.drift_answers = names.map(() => h("p", { class: "answer quiet", role: "status" }));
     const key = names.map((name, index) => h("p", {}, `${index ? "dashed" : "solid"}: `, h("b", {}, name)));
-    fill(this.comparison, h("div", { class: "head" }, h("h2", {}, names.length > 1 ? "Two nights, hours since their beginnings" : "One night, hours since its beginning"),
+    fill(this.comparison, h("div", { class: "head" }, h("h2", {}, names.length > 1 ? "Two sessions, hours since their beginnings" : "One session, hours since its beginning"),
       h("button", { type: "button", class: "small", onclick: () => { this.clear(); this.comparison.hidden = true; } }, "Close")), key,
       h("p", { class: "curve-name row" }, "°C: ", COMPARED.map(([channel, colour]) => h("span", { class: "row" }, swatch({ colour, dash: [], width: 2 }), look_of(channel).name))), place, h("p", { class: "curve-name" }, "Mean drift, px"), drift, this.drift_answers);
     this.drift_place = drift;

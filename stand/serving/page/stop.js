@@ -1,4 +1,4 @@
-// STOP asks nothing, waits for nothing and is tried until the stand has said that it heard.
+// STOP asks nothing, waits for nothing and is repeated until the stand has confirmed it.
 import { clock, say } from "./dom.js";
 
 const AGAIN_MS = 700, LIMIT_MS = 4000, TWICE_MS = 1500;

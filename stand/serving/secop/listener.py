@@ -159,7 +159,7 @@ class _Client:
 
     @property
     def silent_s(self) -> float:
-        """Since it last said something."""
+        """How long since it last sent something, s."""
         return self._loop.time() - self._heard_s
 
     def is_following(self, module: str) -> bool:

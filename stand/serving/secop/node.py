@@ -254,7 +254,7 @@ def _make_description(state: StandState, found: dict[str, Module]) -> dict[str, 
 
 
 def _make_refusal(error: Exception, state: StandState) -> Refusal:
-    """SECoP's class of what an order was refused for. What a device said is the cause of a Conflict."""
+    """SECoP's class of what an order was refused for. What a device reported is the cause of a Conflict."""
     while isinstance(error, Conflict) and isinstance(error.__cause__, StandError):
         error = error.__cause__
     return Refusal(_get_error_class(error, state), str(error))
