@@ -184,7 +184,7 @@ def test_lists_do_as_arrays_and_points_of_another_shape_are_refused():
 
 def test_every_name_that_the_notebook_page_uses_is_there():
     names = set(re.findall(r"thermostand\.([A-Za-z_]+)", NOTEBOOK))
-    assert {"states", "anchored", "calibrate_views"} <= names
+    assert {"states", "rereference", "calibrate_views"} <= names
     assert names <= set(dir(thermostand))
 
 

@@ -152,7 +152,7 @@ def texts(kind: Literal["hart", "vaisala"]) -> Parser:
         return {channel: None if isnan(value) else value for channel, value in values.items()}
 
     def answer(number: int, heard: bytes) -> Any:
-        told = probe._heard(heard)
+        told = probe._parse_reply(heard)
         found = None if told is None else {channel.name: value for channel, value in told.items()}
         return None if found is None else plain(found)
 

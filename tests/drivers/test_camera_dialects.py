@@ -110,7 +110,7 @@ async def test_a_camera_that_has_what_is_needed_is_set_and_grabs(name: str):
             (reading,) = await camera.read()
             features = camera.effective.features
             used = (features["exposure"], features["gain"], features["trigger"] or features["frame_rate"])
-            place = (await camera.temperature_place()).partition(";")[0]
+            place = (await camera.describe_temperature_place()).partition(";")[0]
             assert camera.identity.vendor == "Dialects"
     expected = scene(HEIGHT, WIDTH).astype(np.uint16) * (1 if frame.image.dtype == np.uint8 else 16)
     assert (frame.image == expected).all()

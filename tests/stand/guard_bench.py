@@ -37,7 +37,7 @@ class NotedFile(LatchFile):
         super().__init__(())
         self.log = log
 
-    def save(self, fault: Fault, since_ns: int) -> str:
+    def keep(self, fault: Fault, since_ns: int) -> str:
         self.log.append(f"latch {fault.rule}")
         return ""
 

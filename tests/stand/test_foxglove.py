@@ -70,7 +70,7 @@ async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot
 
     try:
         published.state(state(24.0, NOW_NS))  # channels appear with their first values
-        published.picture(picture)
+        published.publish_picture(picture)
         assert asked == []  # nobody looks
         url = f"ws://127.0.0.1:{port}"
         async with connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as viewer:
@@ -94,8 +94,8 @@ async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot
                 "text": "too warm",
             }
             published.event(event)
-            published.picture(picture)
-            published.picture(picture)  # the same one is not sent again
+            published.publish_picture(picture)
+            published.publish_picture(picture)  # the same one is not sent again
             got = {
                 subscription: (time_ns, content)
                 for subscription, time_ns, content in [await data(viewer) for _ in range(4)]

@@ -36,7 +36,7 @@ def test_ctrl_c_while_a_command_is_imported_ends_with_a_line(tmp_path: Path):
     (tmp_path / "slow.py").write_text(
         "import signal\nprint('importing', flush=True)\nwhile True:\n    signal.pause()\n"
     )
-    code = "from thermostand.foundation.usage import *; make_lazy_app('x', {'go': Lazy('slow', 'go')})(['go'])"
+    code = "from thermostand.foundation.usage import *; make_lazy_app('x', {'go': LazyCommand('slow', 'go')})(['go'])"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment

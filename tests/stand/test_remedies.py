@@ -61,7 +61,7 @@ def test_a_kind_that_is_added_is_found_everywhere(lamp: EventKind):
     row = next(line for line in make_troubleshooting_page().splitlines() if "`lamp.broken`" in line)
     assert [cell.strip() for cell in row.strip("|").split(" | ")[1:]] == [
         "warning",
-        "{lamp} has gone out after {lit_s:min} min: {said}",
+        "{lamp} has gone out after {lit_s:min} min: {text}",
         "exchange DIR's lamp",
         "device_lost",
     ]
@@ -156,14 +156,14 @@ def sites() -> Iterator[tuple[EventKind, set[str], str]]:
             if all(keyword.arg for keyword in call.keywords):
                 yield (
                     NAMED[name],
-                    {str(keyword.arg) for keyword in call.keywords} | ({"said"} if given else set()),
+                    {str(keyword.arg) for keyword in call.keywords} | ({"text"} if given else set()),
                     f"{path.name}:{call.lineno}",
                 )
 
 
 def test_each_site_gives_what_the_text_of_its_row_needs():
     seen = list(sites())
-    assert [(row, where) for row, given, where in seen if not fields_of(row) - {"said"} <= given] == []
+    assert [(row, where) for row, given, where in seen if not fields_of(row) - {"text"} <= given] == []
     assert len({row for row, _, _ in seen}) > 70
 
 

@@ -78,7 +78,7 @@ def runs(draw):
 def lasting(state: RunState) -> dict[str, object]:
     """What a gap leaves; for how long it was out, and how often disturbed, is not known to the last digit."""
     fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-    for name in ("out_ns", "out_since_ns", "seen_ns", "was_held", "disturbances", "restored", "is_cold"):
+    for name in ("out_ns", "out_since_ns", "seen_ns", "was_held", "setup_invalidations", "restored", "is_cold"):
         del fields[name]
     return fields
 

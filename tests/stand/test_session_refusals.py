@@ -1,10 +1,12 @@
 """What the commands on sessions refuse, and how they say it."""
 
 import fcntl
+import io
 import os
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from tests.stand.session_commands import ask, read_refusal
 
@@ -50,7 +52,10 @@ def test_a_command_that_meets_damage_says_that_a_salvage_helps(
 ):
     path = session / series / "0000.mcap"
     data = bytearray(path.read_bytes())
-    data[len(data) * 2 // 5] ^= 1
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     path.write_bytes(data)
     speed = ("--speed", "max") if command == "replay" else ()
     line = ask(command, session, option, tmp_path / "new", *speed, status=1).stderr.splitlines()[-1]

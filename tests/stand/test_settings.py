@@ -17,7 +17,6 @@ import thermostand.drivers.wires
 import thermostand.stand.chamber
 import thermostand.stand.guarding
 import thermostand.stand.imaging
-import thermostand.stand.table
 from thermostand.drivers.devices.kinds import DeviceKind
 from thermostand.drivers.devices.thermometers import ThermometerSettings
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings
@@ -64,8 +63,8 @@ REGISTER_MAP = {
     "Point",
     "Confirm",
     "Write",
-    "Command",
-    "Probe",
+    "RegisterCommand",
+    "UnitProof",
     "IdentityPoint",
 }
 
@@ -101,7 +100,6 @@ def test_no_dataclass_repeats_settings():
         thermostand.stand.chamber,
         thermostand.stand.guarding,
         thermostand.stand.imaging,
-        thermostand.stand.table,
     )
     repeated = {
         each.__name__

@@ -120,7 +120,7 @@ class Stuck:
 
 async def test_a_stop_does_not_wait_for_what_serves_the_others(tmp_path: Path):
     room = Stuck()
-    async with open_stand(tmp_path, rooms=(room,)) as (desk, port):
+    async with open_stand(tmp_path, extra_routes=(room,)) as (desk, port):
         waiting = asyncio.create_task(asyncio.to_thread(said, port, b"GET /stuck HTTP/1.1\r\nHost: localhost\r\n\r\n"))
         await asyncio.to_thread(room.has_begun.wait, LIMIT_S)
         assert (await asyncio.to_thread(post, port))[1]["verb"] == "stop"
@@ -222,7 +222,7 @@ async def test_without_its_thread_stop_is_served_as_everything_else_is(tmp_path:
     async with open_stand(tmp_path) as (desk, port):
         failures = asyncio.Queue[Event]()
         desk.hub.subscribe(lambda item: failures.put_nowait(item) if isinstance(item, Event) else None)
-        monkeypatch.setattr(StopThread, "_look", fails)
+        monkeypatch.setattr(StopThread, "_check_answers", fails)
         with contextlib.suppress(OSError, http.client.HTTPException):
             await asyncio.to_thread(post, port)
         assert (await asyncio.wait_for(failures.get(), LIMIT_S)).kind in ("command", "interface_failed")

@@ -241,7 +241,7 @@ async def test_a_disk_that_hangs_when_the_latch_is_read_counts_as_latched(
 ):
     hanging = threading.Event()
     monkeypatch.setattr(latch, "_READ_WITHIN_S", 0.05)
-    monkeypatch.setattr(latch, "_read", lambda _: hanging.wait())
+    monkeypatch.setattr(latch, "_read_latch", lambda _: hanging.wait())
     assert await rules_after(config_file, tmp_path) == {UNREADABLE}
     hanging.set()
 

@@ -79,8 +79,8 @@ class InProcess:
 
 @asynccontextmanager
 async def viewing(session: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncGenerator[tuple[PageData, Hub]]:
-    monkeypatch.setattr("thermostand.stand.serving.page_data.Helper", lambda *_: InProcess())
-    monkeypatch.setattr("thermostand.stand.serving.page_data.previewer", lambda _: Looking())
+    monkeypatch.setattr("thermostand.stand.serving.page_data.WorkerProcess", lambda *_: InProcess())
+    monkeypatch.setattr("thermostand.stand.serving.page_data.make_previewer", lambda _: Looking())
     hub = Hub()
     found = PageData(hub, WallClock(), folder, TARGET)
     running = asyncio.create_task(found.run(lambda: session))

@@ -228,8 +228,8 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
     check_safe(session)
     trips = [event for event in session.events() if event.kind.startswith("guard.") and event.level == "error"]
     assert [trip.kind for trip in trips] == [f"guard.{rule}"] * (2 if rule == "stage_alarm" else 1)
-    assert [entry for entry in trips_of(directory) if entry != "cleared"] == [rule] * len(trips)
-    assert trips_of(directory).count("cleared") == len(trips)
+    assert [entry for entry in trips_of(directory) if entry != "reset"] == [rule] * len(trips)
+    assert trips_of(directory).count("reset") == len(trips)
 
 
 async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_room(
