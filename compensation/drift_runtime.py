@@ -38,7 +38,7 @@ UNPOWERED_TAU_S = 900.0
 HULL_MARGIN_PX = 1.0  # the markers themselves move by about so much
 COLDEST_degC, HOTTEST_degC = -273.15, 1000.0
 MOST_CORNERS = 2000
-"""Of a hull: that of a night's markers has about 40. Each point is compared with each corner."""
+"""Corners of a hull, at most: that of a session's markers has about 40. Each point is compared with each corner."""
 MOST_IMAGES = 1000
 """The terms of a correction are not larger in all: those of a fit to few temperatures cancel each other, and of a table
 of centres they were five images."""
@@ -142,7 +142,7 @@ class ThermalState:
 
     @property
     def camera_degC(self):
-        """Its temperature, as it was told or is assumed."""
+        """The camera's temperature, as it was given or is assumed."""
         return self.values[0]
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
@@ -192,7 +192,7 @@ class Drift:
     def __init__(self, model):
         """model: what the JSON file holds; ValueError when numbers of it are none, or do not fit together."""
         if model.get("format") != "thermostand drift runtime" or model.get("version") != VERSION:
-            raise ValueError("not a drift runtime model of this version; export the model anew")
+            raise ValueError("not a drift runtime model of this version; export the model again")
         _check(model)
         self._model = model
         self._coefficients = np.array(model["coefficients_px"])

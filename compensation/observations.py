@@ -320,7 +320,7 @@ def _explain_unusable(
         elif not reason and math.isnan(degC):
             reason = "the camera's temperature is unknown"
         elif not reason and TEMPERATURE_SUSPECT in flagged.split(","):
-            reason = "the camera's temperature is in doubt"
+            reason = "the camera's temperature is suspect"
         elif not reason and UNSETTLED in flagged.split(","):
             reason = "the chamber was not in its band when the soak before it ended"
         reasons.append(reason)

@@ -26,8 +26,8 @@ NotNegative = Annotated[float, Field(ge=0)]
 Hull = Annotated[tuple[Pair, ...], Field(min_length=3, max_length=MOST_CORNERS)]
 
 _ASYMMETRY, _NEGATIVE = 1e-6, 1e-6
-"""Of correlations, by rounding. The covariances of 3 drawn nights have positive eigenvalues only, of at least 4.5e-6; a
-type prior and the calibrations of the tests pass."""
+"""Deviations of correlations that rounding explains. The covariances of 3 drawn sessions have positive eigenvalues
+only, of at least 4.5e-6; a type prior and the calibrations of the tests pass."""
 
 
 def check_shape(name: str, values: object, shape: tuple[int, ...]) -> Float:

@@ -48,7 +48,8 @@ class CalibrationGrid(MovingTable, Guaranteed):
 
     @property
     def positions(self) -> tuple[TablePosition, ...]:
-        """In order of visit: there and back through the rotary positions, so that the table takes short ways."""
+        """The positions in order of visit: there and back through the rotary positions, so that the table takes short
+        ways."""
         grid = (
             TablePosition(linear_mm=linear_mm, rotary_deg=rotary_deg)
             for row, linear_mm in enumerate(self.linear_mm)

@@ -29,7 +29,7 @@ class Detectability:
 
 
 def estimate_detectability(plan: Iterable[PlannedStep]) -> Detectability | None:
-    """Of a plan; None when it looks at no drift over set-points."""
+    """Estimate the detectability of a plan; None when it looks at no drift over set-points."""
     visits: list[float] = []
     for planned in plan:
         step = planned.step

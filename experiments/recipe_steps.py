@@ -167,7 +167,7 @@ class StepEntry(Document):
 
     @property
     def name(self) -> str:
-        """Its one key."""
+        """The entry's one key."""
         if self._step is not None:
             return self._step[0].kind
         (name,) = self.model_fields_set

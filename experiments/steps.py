@@ -116,12 +116,12 @@ class KnownStand:
         return None
 
     def move_s(self, axis: str, begin: float, end: float) -> float:
-        """Of a move, mm or deg; ConfigError when the stand has no such axis."""
+        """Compute the time of a move, mm or deg; ConfigError when the stand has no such axis."""
         del axis, begin, end
         return 0.0
 
     def to_home_s(self, axis: str, position: float) -> float:
-        """Of the way from `position` to the home switch; ConfigError as above."""
+        """Compute the time of the way from `position` to the home switch; ConfigError as above."""
         del axis, position
         return 0.0
 
@@ -234,7 +234,7 @@ class Step:
 
     @property
     def words(self) -> str:
-        """As in `soak for 45 min`, for people who watch a run."""
+        """Describe the step as in `soak for 45 min`, for people who watch a run."""
         return self.says.format(**asdict(cast("Any", self))) or self.kind.replace("_", " ")
 
     @property
@@ -426,7 +426,7 @@ class Soak(Step):
 
     @property
     def last_part_s(self) -> float:
-        """For how long before its end the chamber has to be in its band, s."""
+        """How long before its end the chamber has to be in its band, s."""
         return min(_LAST_PART * self.duration_s, _LONGEST_LAST_S) if self.last_s is None else self.last_s
 
     def extend(self, by_s: float) -> Soak:
@@ -499,7 +499,7 @@ class SoakUntilSettled(Step):
 
     @classmethod
     def until(cls, max_s: float, until: Settled, exposure_s: float, chamber_degC: float) -> SoakUntilSettled:
-        """With the thresholds of `until`."""
+        """Return the step with the thresholds of `until`."""
         return cls(
             max_s=max_s,
             min_s=until.min_s,
@@ -533,7 +533,7 @@ class SoakUntilSettled(Step):
 
     @property
     def last_part_s(self) -> float:
-        """For how long before its end the chamber has to be in its band, s."""
+        """How long before its end the chamber has to be in its band, s."""
         return min(_LAST_PART * self.max_s, _LONGEST_LAST_S)
 
     def extend(self, by_s: float) -> SoakUntilSettled:
@@ -775,7 +775,7 @@ COOL_DOWN_AS_FOUND = "cool down as found"  # of a camera that the run finds as w
 
 
 class CoolDownEntry(Document):
-    """As the step CoolDown."""
+    """The entry of a recipe for the step CoolDown."""
 
     band_K: float = Field(default=0.5, gt=0, le=20)
     time_constant_s: float = Field(default=1200.0, gt=0, le=86400)

@@ -36,7 +36,8 @@ class App(typer.Typer):
         super().__init__(cls=OneLineUsage, add_completion=False, no_args_is_help=no_args_is_help, **own)
 
     def command(self, name: str | None = None, **settings: Any) -> Callable[[Function], Function]:
-        """As typer has it; a parameter that is a dataclass is given by options, one for each of its fields."""
+        """Register a command as typer does; a parameter that is a dataclass is given by options, one for each of its
+        fields."""
         register = super().command(name, **settings)
 
         def take(function: Function) -> Function:

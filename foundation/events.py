@@ -96,7 +96,8 @@ class EventKind(str):
         return self.alert(data) if callable(self.alert) else self.alert
 
     def format_text(self, text: str = "", /, **data: object) -> str:
-        """Its text alone. LookupError, TypeError or ValueError when a field is not given, or is none that fits."""
+        """Format the text alone. LookupError, TypeError or ValueError when a field is not given, or is none that
+        fits."""
         if callable(self.text):
             return self.text(text=text, **data)
         return _FORM.vformat(self.text, (), {"text": text, **data})

@@ -48,7 +48,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def write_bytes_atomically(path: Path, data: bytes) -> None:
-    """As `write_atomically`, for what is no text."""
+    """Write bytes as `write_atomically` writes text."""
     _check_place(path)
     try:
         replace_file(path, data)
@@ -96,7 +96,7 @@ def make_durable_folder(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """As `make_durable_folder`; SessionError when the place refuses."""
+    """Make a folder as `make_durable_folder` does; SessionError when the place refuses."""
     try:
         make_durable_folder(path)
     except OSError as error:

@@ -42,13 +42,13 @@ def progress(title: str, total: float) -> Generator[Report]:
 
 @contextmanager
 def hide_progress(title: str, total: float) -> Generator[Report]:
-    """As `progress`, but shows nothing."""
+    """Take progress as `progress` does, but show nothing."""
     yield lambda done, text: None
 
 
 @contextmanager
 def show_late_progress(title: str, total: float) -> Generator[Report]:
-    """As `progress`, but shown only once the work has taken a while."""
+    """Show progress as `progress` does, but only once the work has taken a while."""
     if get_output().quiet:
         yield lambda done, text: None
         return

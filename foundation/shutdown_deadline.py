@@ -22,7 +22,7 @@ class ShutdownDeadline:
         self._started = asyncio.Event()
 
     def begin(self) -> None:
-        """From now on the budget counts; may be called again."""
+        """Start the budget now; may be called again."""
         if self._deadline_s is None:
             self._deadline_s = asyncio.get_running_loop().time() + self._budget_s
             self._started.set()

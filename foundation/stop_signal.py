@@ -23,7 +23,7 @@ class StopSignal:
             signal.signal(number, _do_nothing)
 
     def ask(self) -> None:
-        """From any thread; may be called again."""
+        """Ask for the stop, from any thread; may be called again."""
         with suppress(BlockingIOError):  # it is full of such already
             os.write(self._ask, b"x")
 

@@ -39,8 +39,8 @@ async def cancel_all(tasks: Sequence[asyncio.Task[Any]]) -> None:
 
 
 async def wait_for_first(*waits: Coroutine[Any, Any, object]) -> int:
-    """Until the first of these is over, which has this place among them; the others are cancelled. What it raised is
-    not raised here."""
+    """Wait until the first of these is over and return its place among them; the others are cancelled. What it raised
+    is not raised here."""
     tasks = [asyncio.ensure_future(wait) for wait in waits]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

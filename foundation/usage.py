@@ -36,7 +36,7 @@ _ANSWER: ContextVar[Answer | None] = ContextVar("answer", default=None)
 
 
 def get_answer() -> Answer:
-    """Of the command under way."""
+    """Get the answer of the command under way."""
     found = _ANSWER.get()
     if found is None:
         _ANSWER.set(found := Answer())
@@ -136,14 +136,14 @@ def _report_usage_errors() -> Generator[None]:
 
 
 def report_failure(sentence: object, status: int) -> typer.Exit:
-    """To be raised: the program ends with this status. `error: sentence` is on standard error by then, and with --json
-    a document with both on standard output, unless that has the result already."""
+    """Make the exception to be raised: the program ends with this status. `error: sentence` is on standard error by
+    then, and with --json a document with both on standard output, unless that has the result already."""
     print_error(sentence)
     return _report_status(sentence, status)
 
 
 def report_end(sentence: object, status: int) -> typer.Exit:
-    """As `failed`, of what is nobody's error."""
+    """Report an end as `report_failure` does, when it is nobody's error."""
     typer.echo(escape_line(sentence), err=True)
     return _report_status(sentence, status)
 

@@ -11,8 +11,8 @@ _INFO = re.compile(r"thermostand-(.+)\.dist-info")
 
 
 def read_version() -> str:
-    """From the name of the folder that says what is installed; importlib.metadata, which takes as long to import as all
-    that lists sessions, is asked when there is none, or there are several."""
+    """Read the version from the name of the folder that says what is installed; importlib.metadata, which takes as long
+    to import as all that lists sessions, is asked when there is none, or there are several."""
     found: set[str] = set()
     for folder in sys.path:
         with suppress(OSError):

@@ -66,7 +66,7 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """The id of the process."""
         return self._process.pid
 
     @property
@@ -91,7 +91,7 @@ class WorkerProcess:
         return True
 
     async def end_within(self, deadline: ShutdownDeadline) -> bool:
-        """As `close`, while the event loop goes on."""
+        """Close, as `close` does, while the event loop goes on."""
         self._release()
         ending = asyncio.create_task(self._wait_for_end())
         try:
@@ -140,7 +140,7 @@ def main() -> None:
 
 
 def lower_priority() -> None:
-    """For `prepare`: everything else on the machine goes before this process."""
+    """Lower the priority, for `prepare`: everything else on the machine goes before this process."""
     with suppress(OSError):
         os.nice(19)
     with suppress(OSError, AttributeError):  # Linux

@@ -219,7 +219,7 @@ def _answer(request: _Request, kept: dict[str, object]) -> _Answer:
 
 
 def answer_all(connection: socket.socket, kept: dict[str, object]) -> None:
-    """In the process: one request after the other, until the other end is gone."""
+    """Answer, in the process, one request after the other, until the other end is gone."""
     with connection:  # who asks must not wait for a thread that has ended
         while (data := receive(connection)) is not None:
             try:

@@ -385,7 +385,7 @@ def detect(
     previous: the frame before, for speed and to keep the orientation; when the target has moved too far it is searched
     for again. noise: the camera's; without it covariances come from the residuals, and chi is relative to this image's
     median marker. watch: gets the part of a search that is done, 0 to 1. Raises DetectionError when the target cannot
-    be identified beyond doubt.
+    be identified with certainty.
     """
     grey = make_picture(convert_to_grey(image))
     if previous is not None:

@@ -63,7 +63,7 @@ _BORDER, _SATURATED, _TOO_FEW, _DIVERGED = map(int, (Flag.BORDER, Flag.SATURATED
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
     """state: what was fitted. covariance: of its parameters (N, 12, 12), noise times chi^2. chi: (N,), 1 when the noise
-    model explains the residuals; misfit: (N,), the same sector by sector; levels: (N,), that of ground and disc beside
+    model explains the residuals; misfit: (N,), the same sector by sector; levels: (N,), that of ground and disc next to
     the outline (sectors.py). scatter: (N, 2, 2), the centre's cluster-robust variances and those of independent
     residuals, px^2, NaN for markers that were not looked at for this (sandwich.py). flags: (N,) uint8 of Flag.
     Markers that failed keep their start values, with NaN in the others.

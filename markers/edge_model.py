@@ -83,7 +83,7 @@ class EdgeState:
 
 
 class Work(NamedTuple):
-    """Room for one marker's J'WJ (12, 12) and J'We (12,)."""
+    """Work arrays for one marker's J'WJ (12, 12) and J'We (12,)."""
 
     normal: Float
     right: Float
@@ -142,7 +142,7 @@ def _add_core_equations(
 
 @compile_part
 def load_block(block: Single, pixels: Pixels, region: int, first: int, p: Float, scale: float) -> int:
-    """Copy the pixels of a region from `first` on into a block, as many as there is room for; their number."""
+    """Copy the pixels of a region from `first` on into a block, as many as fit; return their number."""
     table, size = pixels.table[region], min(BLOCK, pixels.counts[region] - first)
     at = np.uint64(first)  # unsigned: not looked at for being negative
     u, v, value, share = table[U], table[V], table[VALUE], table[SHARE]

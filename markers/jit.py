@@ -1,4 +1,4 @@
-"""Functions compiled to machine code. What is called from Python is compiled once per machine and kept beside the
+"""Functions compiled to machine code. What is called from Python is compiled once per machine and kept next to the
 source, or in the user's cache where the installation is read-only (numba's own rule; NUMBA_CACHE_DIR names another
 place)."""
 

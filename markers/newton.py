@@ -77,7 +77,7 @@ class Outcome(NamedTuple):
 
 class Setting(NamedTuple):
     """What all markers of an image are fitted with. ceiling: DN, from which on pixels are saturated. band_sigma: half
-    width of the band, blurs. pixels, work: room for one marker."""
+    width of the band, blurs. pixels, work: work arrays for one marker."""
 
     image: Picture
     noise: Variance

@@ -23,8 +23,8 @@ Mask = NDArray[np.bool_]
 
 CORE, GROUND, DISC = range(3)
 U, V, VALUE, SHARE, RESIDUAL, RISE = range(6)
-"""Rows of `Pixels.table`: column and row in the image, px from the origin; value, DN; weight, 1 unless a refit doubts
-the pixel; then what the model writes: residual over its standard deviation, and how it changes per px that the outline
+"""Rows of `Pixels.table`: column and row in the image, px from the origin; value, DN; weight, 1 unless a refit lowers
+it; then what the model writes: residual over its standard deviation, and how it changes per px that the outline
 moves."""
 
 # Round number; nothing was measured.
@@ -37,8 +37,8 @@ _AT_ONCE = 8
 
 
 class Pixels(NamedTuple):
-    """table: (3 regions, 6 rows, room). counts: (3,) pixels in each region. origin: (2,) column and row that places are
-    relative to, near the marker's centre: single numbers hold no fractions of thousands."""
+    """table: (3 regions, 6 rows, capacity). counts: (3,) pixels in each region. origin: (2,) column and row that places
+    are relative to, near the marker's centre: single numbers hold no fractions of thousands."""
 
     table: Single
     counts: NDArray[np.int64]
@@ -55,7 +55,7 @@ class Limits(NamedTuple):
 
 
 class Gathered(NamedTuple):
-    """seen: pixels of the band in the image, -1 when there are more than there is room for; burnt: saturated ones
+    """seen: pixels of the band in the image, -1 when there are more than fit; burnt: saturated ones
     among them; cut: the band leaves the image."""
 
     seen: int
@@ -109,7 +109,7 @@ def make_picture(image: Image, rows: Mask | None = None) -> Picture:
 
 
 def allocate_pixels(capacity: int) -> Pixels:
-    """Room for `capacity` pixels in each region."""
+    """Allocate the arrays for `capacity` pixels in each region."""
     return Pixels(np.empty((3, _ROWS, capacity + _AT_ONCE), np.float32), np.zeros(3, np.int64), np.zeros(2, np.int64))
 
 

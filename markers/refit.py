@@ -2,7 +2,7 @@
 
 The disc is looked at in 36 sectors. Those that do not look like the model are dropped, worst first, until the rest
 agrees with it. What the other markers say about the place, the shape and the blur holds the fit together meanwhile:
-without it a covered part bends the ellipse to explain itself. Weights that doubt single pixels (Tukey) are not used:
+without it a covered part bends the ellipse to explain itself. Weights that lower single pixels (Tukey) are not used:
 an occluder makes a clean contour of its own, which they follow.
 """
 
@@ -106,7 +106,7 @@ def drop_worst(kept: Bools, misfits: Float, greatest: float) -> bool:
 
 @compile_part
 def drop_neighbours(kept: Bools) -> None:
-    """Drop the sectors beside dropped ones: glare has no edge, and what is left of it looks like a slope."""
+    """Drop the sectors next to dropped ones: glare has no edge, and what is left of it looks like a slope."""
     before = kept.copy()
     for place in range(SECTORS):
         kept[place] = before[place - 1] and before[place] and before[(place + 1) % SECTORS]

@@ -14,7 +14,7 @@ from thermostand.markers.pixels import CORE, DISC, GROUND, RESIDUAL, RISE, SHARE
 Bools = NDArray[np.bool_]
 Sectors = NDArray[np.int32]
 
-# Ten degrees of the outline each; what is set aside is whole sectors.
+# Ten degrees of the outline each; whole sectors are left out.
 SECTORS = 36
 _QUADRANT = SECTORS // 4
 _BLOCK = 256
@@ -50,7 +50,7 @@ def count_kept(kept: Bools) -> int:
 
 @compile_part
 def find_sectors(pixels: Pixels, region: int, first: int, p: Float, places: Sectors) -> int:
-    """The sectors of a region's pixels from `first` on, as many as there is room for in `places`; their number."""
+    """Find the sectors of a region's pixels from `first` on, as many as fit in `places`; return their number."""
     u, v, at = pixels.table[region, U], pixels.table[region, V], np.uint64(first)
     cx, cy = np.float32(p[CX] - pixels.origin[0]), np.float32(p[CY] - pixels.origin[1])
     size = min(len(places), pixels.counts[region] - first)

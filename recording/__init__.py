@@ -1,4 +1,4 @@
-"""A night on the disk: MCAP sessions, written durably, read, repaired, exported. `Session` reads one."""
+"""Sessions on the disk, in MCAP: they are written durably, read, repaired and exported here. `Session` reads one."""
 
 from thermostand.foundation.lazy_names import make_lazy_names
 

@@ -51,7 +51,7 @@ class Motions:
 
     @property
     def texts(self) -> list[str]:
-        """As in `["linear to 250 mm", "flap closing"]`: of each the motion that began last."""
+        """The motions in words, as in `["linear to 250 mm", "flap closing"]`: of each the motion that began last."""
         return [f"{name} {text}" for name, text in dict(self._under_way.values()).items()]
 
     @property

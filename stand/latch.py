@@ -51,8 +51,8 @@ class LatchedFault(BaseModel):
 
 
 class Latch:
-    """Of one stand. fault: what it was made safe for and nobody has reset, None when nothing is. since_ns: when that
-    was found. file: what outlives this process; None in virtual time."""
+    """The latch of one stand. fault: what it was made safe for and nobody has reset, None when nothing is. since_ns:
+    when that was found. file: what outlives this process; None in virtual time."""
 
     def __init__(self, gate: Gate, hub: Hub, clock: Clock) -> None:
         self.fault: Fault | None = None
@@ -85,7 +85,7 @@ class Latch:
             self.hold_gate()
 
     def reset(self) -> None:
-        """Nothing has tripped any more, and the gate is let go; the disk is waited for as by `trip`."""
+        """Forget the trip and release the gate; the disk is waited for as by `trip`."""
         self.fault = None
         self._gate.clear(INTERLOCK)
         if self.file is not None and (failure := self.file.remove()):
@@ -103,7 +103,7 @@ class LatchFile:
 
     @classmethod
     def for_addresses(cls, names: Iterable[str]) -> LatchFile:
-        """In this computer's folder, by the names of the addresses of what heats and cools."""
+        """Find the files in this computer's folder, by the names of the addresses of what heats and cools."""
         folder, names = find_state_folder(), tuple(names)
         return cls(folder / f"{name}{end}" for end in _ENDS for name in names)
 

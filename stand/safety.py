@@ -29,7 +29,7 @@ class SafetyActuator(Protocol):
 
     @property
     def name(self) -> str:
-        """For the sentence that says what is not confirmed."""
+        """The name for the sentence that says what is not confirmed."""
         ...
 
     async def make_safe(self) -> None:
@@ -76,7 +76,7 @@ class _SafeStateTask:
             self._task = asyncio.create_task(self._until_confirmed())
 
     def pending(self) -> Pending | None:
-        """None when what was demanded is confirmed."""
+        """What is not confirmed yet; None when what was demanded is."""
         is_confirmed = self.confirmed == self.demanded
         return None if is_confirmed else Pending(self._actuator.name, self._since_ns, self.failure)
 
@@ -170,7 +170,7 @@ class Safety:
         self._makers = (*self._makers, _SafeStateTask(actuator, pause_s, self._clock, self._on_change))
 
     def add_until_cleared(self, actuator: SafetyActuator) -> None:
-        """As `take`, until an operator resets the hold."""
+        """Take an actuator as `take` does, until an operator resets the hold."""
         if actuator not in self._until_cleared:
             self.take(actuator)
             self._until_cleared[actuator] = self._makers[-1]

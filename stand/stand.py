@@ -61,7 +61,8 @@ class Devices:
 
     @property
     def heat_module(self) -> HeatModule | None:
-        """By what a regulator of our own heats; None where that is a relay, or there is no such regulator."""
+        """The module by which a regulator of our own heats; None where that is a relay, or there is no such
+        regulator."""
         return cast("HeatModule | None", self.every.get("heat_module"))
 
     @property

@@ -52,7 +52,7 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
 
 
 async def prepare_axes(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: Hub, clock: Clock) -> None:
-    """Before a capture: approach again, from below, each axis whose position cannot be relied upon.
+    """Before a capture, approach again, from below, each axis whose position cannot be relied upon.
 
     `commanded`: where the plan put each axis it moved (mm or deg); the others are left alone. An axis is uncertain when
     its motor is without current, its scale is lost, or it stands a step or more elsewhere (stopped by hand); event

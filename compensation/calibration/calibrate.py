@@ -165,7 +165,7 @@ class Model(StrEnum):
 _MOST_TIMES = 2.0
 """Of 21 drawn lenses, f 900 to 7246 px, 11 with scores at held-out positions: there, rays that describe the lens leave
 at most 1.02 times what the pinhole does, those that do not 4 times and more. Without scores the residuals of the fits
-are a weaker sign: of one lens they were 1.51 times, where held-out positions said 4."""
+are a weaker sign: of one lens they were 1.51 times, where held-out positions gave 4."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -226,7 +226,7 @@ def _adjust_once(
 
 def cross_validate_px(views: Views, board: Board) -> float:
     """Root mean square residual per coordinate of pictures that the calibration has not seen, about the poses found
-    from them, corrected for the poses' six degrees of freedom. CalibrationError when that cannot be told, as the
+    from them, corrected for the poses' six degrees of freedom. CalibrationError when that cannot be known, as the
     pictures without those that are held out do not determine a camera."""
     count = len(views.centres_px)
     if (left := count - math.ceil(count / _FOLDS)) < LEAST_VIEWS:

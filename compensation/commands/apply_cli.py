@@ -166,8 +166,8 @@ def _open_session(path: Path, model: DriftModel, camera: str | None, incomplete:
 # Not done by itself: it would take out a shift of the target that somebody wants to see, and gains 0.3 to 1.2 mpx where
 # nothing was moved.
 def _offer_rereference(model: DriftModel, session: Session) -> None:
-    """A message where the model is of other nights, and this one has reference frames that would take out what differs
-    between them."""
+    """Print a hint where the model is of other sessions, and this one has reference frames that would take out what
+    differs between them."""
     if model.form != "thermal" or session.metadata.get("session_id") in model.facts.session_ids:
         return
     if any(mark.parameters.get("role") == str(Role.REFERENCE) for mark in session.steps()):

@@ -160,9 +160,9 @@ def fit(
     A table has a row for each centre: frame, marker, x_px, y_px, camera_degC, and where known time_ns, chamber_degC,
     role, air_degC, var_x_px2, cov_xy_px2, var_y_px2. It needs no session and no stand.
 
-    One night does not show how well nights repeat: a dead zone in a mount or a thermometer far from the camera may err
-    by 20 mpx and more on another one. What that adds is assumed then, and the model says so; two nights over the same
-    set-points, in another order, measure it.
+    One session does not show how well sessions repeat: a dead zone in a mount or a thermometer far from the camera may
+    err by 20 mpx and more in another one. What that adds is assumed then, and the model says so; two sessions over the
+    same set-points, in another order, measure it.
 
     With --like few frames are enough, at two temperatures or more: a warm-up, the reference and a set-point on each
     side of it, 14 and 45 degC say, teach more than a hot one alone.
@@ -220,7 +220,7 @@ def rereference(
 
 
 def _try_evaluate(model: DriftModel, observations: Observations) -> tuple[Evaluation | None, str]:
-    """What it gains, or None and why that cannot be told: the model stands without it."""
+    """Return what the model gains, or None and why that is not known: the model is valid without it."""
     try:
         return evaluate(model, observations), ""
     except SessionError as error:
@@ -277,7 +277,7 @@ def report(
         str | None, typer.Option(help="With the stand's budget, by its geometry: a file, or the installed `paper`.")
     ] = None,
     validation: Annotated[
-        Path | None, typer.Option(help="With the result of `compensate validate`: the JSON file beside its page.")
+        Path | None, typer.Option(help="Show the result of `compensate validate`, too: the JSON file next to its page.")
     ] = None,
     details: DetailsOption = None,
     camera: CameraName = None,
@@ -285,7 +285,8 @@ def report(
 ) -> None:
     """Write the report of sessions of one camera: drift, model, and what it gains at held-out temperatures.
 
-    Its numbers are in a JSON file of the same name beside it. Without reference and fit frames: the drift alone.
+    Its numbers are in a JSON file of the same name next to it. Without reference and fit frames it shows the drift
+    alone.
 
     Example: compensate report sessions/20260101T180000Z-thermal-cycle --model model.json -o report.html
     """

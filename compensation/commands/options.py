@@ -96,8 +96,8 @@ def make_warning_sink(incomplete: bool) -> Say | None:
 
 @contextmanager
 def report_marker_search(count: int, *, is_quick: bool = False) -> Generator[Report]:
-    """Progress of a search in so many images; is_quick: shown only once it has taken a while. What has to be compiled
-    first is said, and no part of the time left."""
+    """Progress of a search in so many images; is_quick: shown only once it has taken a while. When code has to be
+    compiled first, that is shown in place of the time left."""
     from thermostand.markers.compile_ahead import compile_ahead  # numba takes long to load
 
     compile_ahead(

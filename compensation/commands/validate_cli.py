@@ -39,7 +39,7 @@ def validate_session(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of a session of the validation recipe.")],
     camera: Annotated[Path, typer.Option(help="The camera file of `compensate calibrate`.")],
     model: Annotated[Path, typer.Option(help="The drift model of `compensate fit`.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write; a JSON file is written beside it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file to write, with a JSON file next to it.")],
     budget: Annotated[
         str | None, typer.Option(help="Compute the stand's part, too: its geometry, a file or the installed `paper`.")
     ] = None,
@@ -49,9 +49,10 @@ def validate_session(
     *,
     finding: MarkerSearch,
 ) -> None:
-    """How far the target at V0..V3 seems to move with temperature, before and after compensation, beside the paper's.
+    """Measure how far the target at V0..V3 seems to move with temperature, before and after compensation, next to the
+    paper's values.
 
-    Of a session of several cameras it is the one whose serial number the camera file has.
+    In a session of several cameras the one is used whose serial number the camera file has.
 
     Example: compensate validate sessions/20260101T180000Z-validation --camera camera.json --model model.json
     -o validation.html
@@ -82,7 +83,7 @@ def _choose_numbers_path(page: Path) -> Path:
     """Where the numbers go; ConfigError when that is the page, or one of the two cannot be written."""
     numbers_path = page.with_suffix(".json")
     if numbers_path == page:
-        raise ConfigError(f"{page}: the page is HTML, and a JSON file is written beside it; name it .html")
+        raise ConfigError(f"{page}: the page is HTML, and a JSON file is written next to it; name it .html")
     for path in (page, numbers_path):
         check_writable(path)
     return numbers_path

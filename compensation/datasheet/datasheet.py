@@ -26,7 +26,7 @@ from thermostand.foundation.errors import SessionError
 
 COVERAGE = 2.0
 """Expanded uncertainties are this many standard ones: about 95 % of a normal distribution."""
-BETWEEN_SESSIONS = "night to night"
+BETWEEN_SESSIONS = "session to session"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +79,10 @@ class MeasuredQuantity:
 
 
 def pool_sessions(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
-    """The mean of the same quantity over nights. What each night's statistics say shrinks with their number, what is of
-    type B is common to all; how they differ is a contribution of its own."""
+    """Return the mean of the same quantity over sessions.
+
+    What the statistics of each session say shrinks with the number of sessions. What is of type B is common to all. How
+    the sessions differ is a contribution of its own."""
     known = [one for one in nights if not math.isnan(one.value)]
     if len(known) < 2:
         return known[0] if known else nights[0]
@@ -94,7 +96,7 @@ def pool_sessions(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
         sensitivity = same[0].sensitivity or 1.0
         lines.append(replace(same[0], u=amount / abs(sensitivity), sensitivity=sensitivity))
     spread = float(np.std(values, ddof=1)) / math.sqrt(count)
-    basis = f"standard deviation of the mean of {count} nights"
+    basis = f"standard deviation of the mean of {count} sessions"
     lines.append(Contribution(BETWEEN_SESSIONS, "A", spread, known[0].unit, basis))
     return replace(known[0], value=float(np.mean(values)), contributions=tuple(lines))
 
@@ -515,7 +517,7 @@ def _compute_surroundings_share(share: MeasuredQuantity) -> MeasuredQuantity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Datasheet:
-    """quantities: in the order of the page. nights: the same of each session by itself. warming: the first warm-up.
+    """quantities: in the order of the page. nights: the same of each single session. warming: the first warm-up.
     air_degC, camera_degC: range of the visits. model: in use."""
 
     observations: Observations
@@ -600,6 +602,6 @@ def _evaluate_forms(model: DriftModel, observations: Observations) -> dict[str, 
             continue
         try:
             found[one.form] = evaluate(one, observations)
-        except SessionError:  # said on the page: this form cannot be scored
+        except SessionError:  # the page states that this form cannot be scored
             continue
     return found

@@ -6,7 +6,7 @@
     target_certificate: CMM report 2026-014, k=2, 2 um
     thermometer_certificate: DAkkS D-K-15000, 2026-03
     sensor_positions:
-      air: 40 mm beside the camera, shielded
+      air: 40 mm next to the camera, shielded
     u_air_K: 0.05
 
 All of it is optional; what is missing is printed as not stated.

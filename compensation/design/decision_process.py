@@ -1,4 +1,4 @@
-"""The process that decides for a night, see foundation/worker_process.py."""
+"""The process in which a run decides on its next visit, see foundation/worker_process.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The next visit of a night that decides, or its end: I-optimal design over the wanted temperatures.
+"""The next visit of a session that decides, or its end: I-optimal design over the wanted temperatures.
 
 I-optimal: the next visits are those after which the drift model's variance, averaged over the states in which it is
 wanted, is least. A slow part of a camera shows only on a long way in one direction, so whole courses of some hours
@@ -46,7 +46,7 @@ from thermostand.recording.repair.salvage import salvage_unfinished
 # of the drift model, for many courses at once.
 #
 # The air follows a set-point by a limited ramp and a first-order lag; the camera is linear in lags of the air, fitted
-# to the night so far. Lags and plays are those of compensation/drift_runtime.py.
+# to the session so far. Lags and plays are those of compensation/drift_runtime.py.
 
 STEP_S = 60.0  # of the forecast: a quarter of the fastest lag; time grows in inverse proportion
 # Assumed, not learned from the stand: off by two, the forecast air arrives some minutes early or late.
@@ -60,7 +60,7 @@ _EVERY_READING = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSurroundings:
-    """What the night says of chamber and camera. air (2,): offset and slope of the recorded air over set-points.
+    """What the session shows of chamber and camera. air (2,): offset and slope of the recorded air over set-points.
     camera (2 + K,): of a powered camera, a constant, the weights of the air and of its lags. ramp_K_per_min: at most.
     """
 
@@ -323,7 +323,7 @@ def _copy_segment(segment: Path, folder: Path) -> None:
 
 
 def _ignore_warning(sentence: str) -> None:
-    """A night under way lacks its rest."""
+    """Ignore what is missing: a session under way lacks its rest."""
 
 
 # Set-points to choose from; nothing was measured. Time grows in proportion.
@@ -335,10 +335,10 @@ _UNCHECKED = "what the model leaves between set-points is seen at three of them"
 
 @dataclass(frozen=True, slots=True)
 class DesignGoal:
-    """What a night is for, and within what it decides. range_degC: set-points at which the model is wanted; none
-    outside is chosen, nor one of held_out_degC. residual_px: the predicted residual with which the night is content.
-    soaks_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there, see
-    list_wanted_states."""
+    """What a session is for, and within what it decides. range_degC: set-points at which the model is wanted; none
+    outside is chosen, nor one of held_out_degC. residual_px: the predicted residual at which the session may
+    end. soaks_s: to choose from. ramp_K_per_min: of the chamber, at most. states: in which the model is wanted there,
+    see list_wanted_states."""
 
     range_degC: tuple[float, float]
     residual_px: float
@@ -394,7 +394,7 @@ def decide(observations: Observations, wanted: DesignGoal) -> Decision:
 
 
 def predict_residual_px(model: ThermalModel, asked: ForecastState) -> float:
-    """RMS of a coordinate over these situations and the outline of the markers, within the night."""
+    """Return the RMS of a coordinate over these situations and the outline of the markers, within the session."""
     hull_px = model.facts.hull_px
     situations, places = len(asked.air_degC), len(hull_px)
     states = asked.states.where(np.repeat(np.arange(situations), places))

@@ -1,4 +1,4 @@
-"""Steps in a night that no thermal state explains: a camera that was touched, a fixing that slipped, a marker moved.
+"""Steps in a session that no thermal state explains: a camera that was touched, a fixing that slipped, a marker moved.
 
 All frames that show the target in its place are looked at: visits, warm-ups, revisited references.
 """
@@ -308,7 +308,7 @@ def _fit_instant_motions(frames: _SeriesFrames) -> tuple[Float, Float, Float, Fl
 # On 160 clean sessions, and as many with one bump, what the forms miss explains up to 29, with steps of up to 30 mpx;
 # bumps of 50 mpx at rest explain 16 to 100. Twice 17 would lose those of them that explain less than 34.
 _GAIN, _GAIN_MARKER = 17.0, 25.0
-"""Log likelihood that a step has to explain, chosen on nights of drawn cameras without any (numbers 2000 to 2079)."""
+"""Log likelihood that a step has to explain, chosen on sessions of drawn cameras without any (numbers 2000 to 2079)."""
 # The limit before, 20 mpx, lies within what the forms miss; twice 35 mpx would pass over bumps of 50.
 _LEAST_PX, _LEAST_MARKER_PX = 0.035, 0.020
 """What the forms of thermal states miss comes in steps, too, of up to 30 mpx."""
@@ -359,8 +359,9 @@ def _move_back(observations: Observations, index: int, bump: Bump, centres: Floa
 
 
 def _find_rigid_bumps(series: SessionSeries) -> Iterator[Bump]:
-    """Steps of the whole image, the largest first, each beside those found before it; then all estimated together.
-    Where one is found the series is looked at minute by minute: a step amidst an instant looks like two halves."""
+    """Find steps of the whole image, the largest first, each together with those found before it; then estimate all
+    together. Where one is found the series is looked at minute by minute: a step amidst an instant looks like two
+    halves."""
     before_ns: list[int] = []
     while len(before_ns) < _MOST:
         best, size_px = _find_largest_step(series, series.find_instants(before_ns))
@@ -431,11 +432,11 @@ def _find_marker_bumps(series: SessionSeries) -> Iterator[Bump]:
             yield _make_bump(series, int(series.boundaries[best]), (*amount, 0.0, 0.0), (*sigma, 0.0, 0.0), marker)
 
 
-# What of a night's drift no thermal state explains and no single step either: fixings that slip again and again, or
+# What of a session's drift neither a thermal state nor a single step explains: fixings that slip again and again, or
 # settle differently each time.
 #
 # A joint that sticks and slips moves the image along one line; fixings that settle differently after each change move
-# it in any direction. In nights of 24 drawn cameras each (numbers 2400 to 2423, by which the limits were chosen) what
+# it in any direction. In sessions of 24 drawn cameras each (numbers 2400 to 2423, by which the limits were chosen) what
 # is left along its main axis is 1.6 to 29 times that across (3 below 3) with slips, 1.2 to 3.1 (1 above 2.4) with
 # fixings that settle differently; in cameras that repeat it is 0.1 to 2.4 mpx.
 
@@ -467,7 +468,7 @@ class UnrepeatedMotion:
 
 
 def find_unrepeated(observations: Observations, bumps: Sequence[Bump]) -> tuple[UnrepeatedMotion, ...]:
-    """Of each session with enough instants to tell, beside the steps that were found in it."""
+    """Find them in each session with enough instants to decide, besides the steps that were found in it."""
     found: list[UnrepeatedMotion] = []
     for index in range(len(observations.sessions)):
         try:

@@ -85,8 +85,8 @@ class DriftModel(ABC):
         """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself."""
 
     def of_sessions(self, session_ids: Iterable[str]) -> Self:
-        """The model for these sessions: `covariance` is of any night, and smaller of those that were fitted where what
-        another night adds is not small beside what the form leaves."""
+        """The model for these sessions: `covariance` holds for any session, and is smaller for those that were fitted
+        where what another session adds is not small compared with what the form leaves."""
         return self
 
     @abstractmethod

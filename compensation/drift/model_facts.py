@@ -19,7 +19,7 @@ from thermostand.experiments.steps import Role
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import SessionError
 
-# A step of the image in a night: what is recorded of one that was found.
+# A step of the image in a session: what is recorded of one that was found.
 
 MOTIONS = 4  # shift along I and J, turn, scale
 

@@ -52,7 +52,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 def _check_version(version: int) -> int:
     if version < SCHEMA_VERSION:
-        raise ValueError(f"{version} is of an earlier, unreleased version of thermostand; fit the model anew")
+        raise ValueError(f"{version} is of an earlier, unreleased version of thermostand; fit the model again")
     if version > SCHEMA_VERSION:
         raise ValueError(f"{version} is of a later version; this one reads up to {SCHEMA_VERSION}")
     return version
@@ -100,8 +100,8 @@ _Term = Annotated[Term, BeforeValidator(parse_term), PlainSerializer(_serialise_
 
 class ThermalFile(_File):
     """The thermal form. coefficient_covariance_px2 (8 H, H): of each motion one below the other. least_on_s: null when
-    the camera was never switched on within the record. between_nights_px: one standard deviation of what a night that
-    was not fitted adds, null where that is not known; with nights_compared 0 it was assumed, not measured."""
+    the camera was never switched on within the record. between_nights_px: one standard deviation of what a session
+    that was not fitted adds, null where that is not known; with nights_compared 0 it was assumed, not measured."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[_Term, ...]

@@ -96,7 +96,7 @@ def _intersect_ranges(ranges: Sequence[Pair]) -> Pair:
 def _check_same_type(observations: Observations, units: Sequence[ThermalModel]) -> None:
     if len(units) < _FEWEST:
         raise SessionError(
-            f"a type is known by {_FEWEST} units or more, each fitted over a night; given are {len(units)}"
+            f"a type is known by {_FEWEST} units or more, each fitted to a session; given are {len(units)}"
         )
     for one in units[1:]:
         if one.terms != units[0].terms:
@@ -118,7 +118,7 @@ _SAME_PLACE_PX = 10.0
 
 
 def rereference(model: DriftModel, observations: Observations, frames: Mask | None = None) -> ThermalModel:
-    """The thermal form of the model, for this session: it takes points of it to where the model's first night has its
+    """The thermal form of the model, for this session: it takes points of it to where the model's first session has its
     reference, as if nothing had been moved in between, with the uncertainty of that.
 
     frames (F,): of the session, by default its REFERENCE frames; where they were taken in another thermal state than
@@ -135,7 +135,7 @@ def rereference(model: DriftModel, observations: Observations, frames: Mask | No
     found = (
         compute_features(states, [term.feature for term in thermal.terms], thermal.origin) - thermal.reference_features
     )
-    # Against where the model's first night had them at the reference.
+    # Against where the model's first session had them at the reference.
     known = wanted & np.isfinite(found).all(axis=1)
     rows = compute_displacements_from(observations, known, thermal.facts.reference_centres_px)
     if len(rows.frame) == 0:

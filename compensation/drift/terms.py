@@ -50,7 +50,7 @@ TERMS: dict[str, type[Term]] = {}
 
 
 class Term(Document):
-    """A feature of the drift, and all that is to be said of its kind; fields are its parameters, with units.
+    """A feature of the drift, and all facts about its kind; fields are its parameters, with units.
 
     kind: its name in model files. title: its name in a model's, where the first field's range stands behind it.
     """
@@ -82,7 +82,7 @@ class Term(Document):
 
     @classmethod
     def usual(cls) -> Sequence[Term]:
-        """Those that every fit has; the night says how much each counts."""
+        """The terms that every fit has; the data decide how much each counts."""
         return (cls(),)
 
 
@@ -134,7 +134,7 @@ class AmbientLag(Term):
 
     @classmethod
     def usual(cls) -> Sequence[Term]:
-        """The slowest are for what creeps, and for a night that begins before all is warm; lags between two of these
+        """The slowest are for what creeps, and for a session that begins before all is warm; lags between two of these
         are sums of them."""
         # Eight do what fifteen did on 16 drawn cameras. Reaching 450 min lowered the median from 3.3 to 2.0 mpx, the
         # worst from 32 to 17 and what creeps from 7.3 to 2.2. They lie within a factor of about two of each other.

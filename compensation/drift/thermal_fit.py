@@ -1,5 +1,5 @@
-"""Observations -> thermal model: every term there is, weighed by the night's own evidence (below), and what
-that leaves at set-points, and at nights, that were left out."""
+"""Observations -> thermal model: every term there is, weighed by the session's own evidence (below), and what
+that leaves at set-points, and in sessions, that were left out."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ _PRIOR_LOG_WIDTH, _PRIOR_LOG_SIGMA = math.log(20.0), 3.0
 """A coefficient is expected to be 20 times the noise, within a factor of e^3: a weak prior on the widths."""
 # With it 95 and 92 % of all answers hold on two sets of drawn cameras, without it 82 and 81 %.
 _COVARIANCE_INFLATION = 1.25
-"""One night shows states in one order only, and its most likely widths and terms are taken for the true ones: on other
-nights answers are off by this much more than their posterior says (24 drawn cameras)."""
+"""One session shows states in one order only, and its most likely widths and terms are taken for the true ones: in
+other sessions answers are off by this much more than their posterior says (24 drawn cameras)."""
 _LOG_WIDTH_LIMITS, _LOG_NOISE_LIMITS = (math.log(1e-3), math.log(1e4)), (0.0, math.log(1e4))
 # A bound only: the optimiser's own criteria end it.
 _ROUNDS = 60
@@ -219,8 +219,8 @@ _LEAST_PX, _STEP_S = 0.003, 300.0
 # Without it 90, 91 and 93 % of the unflagged intervals hold on other sessions of the 48 judged cameras (switching on,
 # small steps, jumps), with it 92, 96 and 96. The interval's own part grows with the root: by 1.4 for twice as much.
 _JACKKNIFE_WEIGHT = 4.0
-"""The jackknife over the set-points of one night sees a part of what another night brings: its variance counts so many
-times. Chosen on 48 drawn cameras, judged on 48 others."""
+"""The jackknife over the set-points of one session sees a part of what another session brings: its variance counts so
+many times. Chosen on 48 drawn cameras, judged on 48 others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -284,8 +284,8 @@ def _compute_model_discrepancy_px(taught: _ThermalFit) -> Float:
 
 
 def _compute_left_out_sessions_px2(taught: _ThermalFit) -> Float:
-    """(N, 2): mean square that is left of each night by what the others teach, noise taken off, which shows what of the
-    drift does not repeat between them; of the nights that can be compared."""
+    """(N, 2): mean square that a fit of the other sessions leaves of each session, noise taken off. It shows what of
+    the drift does not repeat between them. Only sessions that can be compared have a row."""
     trained, rows = taught.trained, taught.rows
     night = trained.observations.session[rows.frame].astype(float)
     nights = [index for index in np.unique(night).tolist() if _is_covered_by_others(rows.chamber_degC, night, index)]
@@ -301,8 +301,8 @@ def _compute_left_out_sessions_px2(taught: _ThermalFit) -> Float:
 
 
 def _is_covered_by_others(chamber_degC: Float, night: Float, index: float) -> bool:
-    """Whether the other nights were at all set-points of this one, and at most of all: else without it a fit has to
-    extrapolate."""
+    """Whether the other sessions were at all set-points of this one, and at most of all: otherwise a fit without it has
+    to extrapolate."""
     own, others = set(chamber_degC[night == index].tolist()), set(chamber_degC[night != index].tolist())
     return bool(own) and own <= others and len(others) >= _MOST_OF * len(own | others)
 

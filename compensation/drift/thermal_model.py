@@ -31,26 +31,26 @@ from thermostand.compensation.history.thermal_history import Float, States, Ther
 
 # Instead of it 3 or 5 mpx for all, or a posterior 1.3 to 2 times as wide, were no better at the same width.
 _LEAST_PX, _OF_DISCREPANCY = 0.002, 0.8
-"""What a night leaves at set-points that were left out it leaves again, otherwise, on another one; and a little in any
-case. Chosen on presets 300 to 303 and 48 drawn cameras."""
+"""What a session leaves at set-points that were left out another session leaves again, in another way; and a little
+in any case. Chosen on presets 300 to 303 and 48 drawn cameras."""
 # On 56 pairs of development sessions 92.5 to 100 % of the unflagged answers hold in most cases, for 91.3 to 100 without
 # the prior. Where no sessions can be compared Student's factor is 1.42; half the weight makes it 2.2, twice 1.18.
 _PRIOR_SESSIONS = 4.0
-"""The prior weighs as much as so many nights."""
+"""The prior weighs as much as so many sessions."""
 _SIGMA_95, _TAIL = 1.959964, 0.975
 
 
 @dataclass(frozen=True, slots=True)
 class BetweenSessions:
-    """sigma_px: along I and J; 1.96 times it is half of the 95 % interval of what another night adds. nights: that were
-    compared with others; 0: it was assumed, not measured."""
+    """sigma_px: along I and J; 1.96 times it is half of the 95 % interval of what another session adds. nights: how
+    many sessions were compared with others; 0: it was assumed, not measured."""
 
     sigma_px: Pair
     nights: int
 
     @property
     def is_assumed(self) -> bool:
-        """Whether no two nights were compared."""
+        """Whether no two sessions were compared."""
         return self.nights == 0
 
     @property
@@ -59,16 +59,16 @@ class BetweenSessions:
         i, j = (1e3 * sigma_px for sigma_px in self.sigma_px)
         if self.is_assumed:
             return (
-                f"how well nights repeat was assumed, not measured: {i:.1f} mpx (I) and {j:.1f} mpx (J) are added on "
-                "nights that were not fitted; a second night over the same set-points, in another order, measures it"
+                f"how well sessions repeat was assumed, not measured: {i:.1f} mpx (I) and {j:.1f} mpx (J) are added in "
+                "sessions that were not fitted; a second one over the same set-points, in another order, measures it"
             )
-        shown = "one night shows" if self.nights == 1 else f"{self.nights} nights show"
-        return f"nights repeat to {i:.1f} mpx (I) and {j:.1f} mpx (J), as {shown}"
+        shown = "one session shows" if self.nights == 1 else f"{self.nights} sessions show"
+        return f"sessions repeat to {i:.1f} mpx (I) and {j:.1f} mpx (J), as {shown}"
 
 
 def estimate_between_sessions(discrepancy_px: Float, left_px2: Float) -> BetweenSessions:
-    """discrepancy_px (2,): what is left at set-points left out, within nights. left_px2 (N, 2): mean square that is
-    left of each of N nights by a fit of the others, noise taken off; (0, 2) where none can be compared."""
+    """discrepancy_px (2,): what is left at set-points left out, within sessions. left_px2 (N, 2): mean square that
+    is left of each of N sessions by a fit of the others, noise taken off; (0, 2) where none can be compared."""
     nights = len(left_px2)
     assumed_px2 = _LEAST_PX**2 + (_OF_DISCREPANCY * discrepancy_px) ** 2
     measured_px2 = np.maximum(left_px2 - discrepancy_px**2, 0.0).sum(axis=0)
@@ -105,8 +105,8 @@ class ThermalModel(DriftModel):
     the covariance has beyond that; it says which states are like those of the fit.
 
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
-    the shift at the reference is about 0. discrepancy_px is within nights. between_nights: what another night adds to
-    it, which `covariance` contains; None in older models, in which the discrepancy has it, and of nights that were
+    the shift at the reference is about 0. discrepancy_px is within sessions. between_nights: what another session adds
+    to it, which `covariance` contains; None in older models, in which the discrepancy has it, and of sessions that were
     fitted. has_warm_up: whether a warm-up was among the training frames.
     """
 
@@ -146,8 +146,8 @@ class ThermalModel(DriftModel):
     def covariance(self, xy_px: Float, state: Situation) -> Float:
         """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which
         know little of a state unlike those of the fit, and of what the form leaves unexplained. That was seen at
-        set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit. On any
-        night but those fitted: of these ask the model that `of_sessions` gives."""
+        set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit. It holds
+        for sessions that were not fitted: of those that were, ask the model that `of_sessions` gives."""
         found = self._compute_features(state, len(xy_px))
         moved = compute_motions(xy_px, self.facts.image_size)
         variance = np.einsum("nh,mhk,nk->nm", found, self.coefficient_covariance, found, optimize=True)
@@ -160,7 +160,7 @@ class ThermalModel(DriftModel):
         return unexplained if known is None else unexplained + np.diag(np.square(known.sigma_px))
 
     def of_sessions(self, session_ids: Iterable[str]) -> ThermalModel:
-        """The model for these sessions: where it was fitted to all of them, without what other nights add."""
+        """The model for these sessions: where it was fitted to all of them, without what other sessions add."""
         is_own = set(session_ids) <= set(self.facts.session_ids)
         return replace(self, between_nights=None) if is_own else self
 

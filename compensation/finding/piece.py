@@ -39,7 +39,7 @@ Float = NDArray[np.float64]
 
 # The search then costs 8 % of a piece; with half as many frames 16.
 FRAMES_PER_PIECE = 64
-"""A search costs as much as five tracked frames, and several workers should have something to do in a short night."""
+"""A search costs as much as five tracked frames, and several workers should have something to do in a short session."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -132,7 +132,7 @@ _AMBIENT, _POWER = "thermometers.air", "relays.camera_power"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThermalHistory:
-    """One session's record: instants, ns, ascending, and values; without readings that are BAD or in doubt.
+    """One session's record: instants, ns, ascending, and values; without readings that are BAD or suspect.
 
     ambient_degC: of the air near the camera. powered: 0 or 1, until the next instant. camera_degC: its own reading,
     in steps of resolution_K (0: none), refined within them.

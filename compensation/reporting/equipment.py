@@ -30,7 +30,7 @@ def list_equipment(session: Session) -> list[Line]:
 
 
 def _list_identities(session: Session) -> Iterator[Line]:
-    """What each device said of itself, or its register map of it, the last time; the camera of these frames first."""
+    """What each device, or its register map, last stated about it; the camera of these frames comes first."""
     found: dict[str, dict[str, Any]] = {}
     for event in session.events():
         if event.kind == DEVICE_IDENTITY:
@@ -71,7 +71,7 @@ def _format_range(low: float, high: float, unit: str) -> str:
 
 
 def _list_stand_devices(session: Session, *, are_named: bool) -> Iterator[Line]:
-    """are_named: whether the devices have said what they are; else it is taken from the stand's file."""
+    """are_named: whether the devices have stated what they are; else it is taken from the stand's file."""
     text = session.attachment("config.yaml")
     try:
         data: Any = parse_yaml(text or "", "config.yaml")

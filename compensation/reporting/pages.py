@@ -1,4 +1,4 @@
-"""The pages beside the report: of a datasheet, also as JSON, of a calibration and of a validation."""
+"""The pages besides the report: of a datasheet, also as JSON, of a calibration and of a validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of a compensation: one HTML file that needs nothing else, its numbers beside it, and the whole way there.
+"""The report of a compensation: one HTML file that needs nothing else, its numbers next to it, and how both are made.
 
 report.json has every number of report.html under the names of numbers.py; report.html.jinja has every sentence.
 """
@@ -122,7 +122,7 @@ def check_report_writable(path: Path, *inputs: Path | None) -> None:
 
 
 def get_numbers_path(page_path: Path) -> Path:
-    """Of the numbers that belong to a page: report.json beside report.html."""
+    """Return the path of the numbers that belong to a page: report.json next to report.html."""
     return page_path.with_name(f"{page_path.stem}.json")
 
 

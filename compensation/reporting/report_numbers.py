@@ -159,8 +159,8 @@ class FormulaNumbers:
 
 @dataclass(frozen=True, slots=True)
 class ModelNumbers:
-    """candidates: every form tried, with its errors at temperatures left out. between_nights_px: what a night that was
-    not fitted adds, None where that is not known; with nights_compared 0 it was assumed, not measured."""
+    """candidates: every form tried, with its errors at temperatures left out. between_nights_px: what a session that
+    was not fitted adds, None where that is not known; with nights_compared 0 it was assumed, not measured."""
 
     form: str
     title: str

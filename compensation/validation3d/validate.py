@@ -314,7 +314,7 @@ def compute_deviations(
     errors_px: Float | None = None,
 ) -> Deviations:
     """Of centres (F, N, 2), which may be corrected. model_px2 (F, N, 2, 2), errors_px (V, F, N, 2): of the corrections,
-    as poses.Doubts has them.
+    as CentreUncertainty has them.
 
     The frames of a position at a temperature are averaged first. CalibrationError when V0, V1, ... at the reference
     have no pose.

@@ -82,7 +82,7 @@ class DeviceCheck:
         self.add(Finding(self.name, what, verdict, text, advice, data or {}))
 
     def warn(self, text: str, advice: str) -> None:
-        """Of the state in which it is."""
+        """Add a warning about the state in which the device is."""
         self.found("state", "warning", text, advice)
 
     async def open_and_read(self) -> dict[str, float]:

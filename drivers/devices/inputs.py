@@ -69,7 +69,7 @@ class Inputs:
         await self.read()
 
     async def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: there is nothing to release."""
 
     async def read(self) -> tuple[Reading, ...]:
         """Every contact; raises DeviceError."""

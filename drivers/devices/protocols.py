@@ -90,23 +90,23 @@ class Switches(Sensor, Actuator, Protocol):
     has_timer: bool
 
     async def switch(self, channel: str, on: bool) -> None:
-        """On or off, confirmed."""
+        """Switch on or off, confirmed."""
         ...
 
     async def hold_on(self, channel: str, duration_s: float) -> None:
-        """On for so long from now."""
+        """Switch on for so long from now."""
         ...
 
 
 class HeatOutput(Protocol):
-    """By what a regulator of our own heats: pulses of a relay, or a current. Without us it ends by itself.
+    """The output by which a regulator of our own heats: pulses of a relay, or a current. Without us it ends by itself.
     uncontrolled: why it may heat though it was commanded off, "" while it obeys, and once it was confirmed `off`."""
 
     uncontrolled: str
 
     @property
     def identity(self) -> Identity | None:
-        """Of a device of its own that has answered; else None."""
+        """The identity of a device of its own that has answered; else None."""
         ...
 
     async def open(self) -> None:
@@ -114,7 +114,7 @@ class HeatOutput(Protocol):
         ...
 
     async def arm(self) -> None:
-        """Before control begins; DeviceError when it could not be relied upon."""
+        """Prepare before control begins; DeviceError when it could not be relied upon."""
         ...
 
     async def give(self, percent: float, *, at_once: bool = False) -> None:

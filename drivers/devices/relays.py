@@ -81,7 +81,7 @@ class Relays:
         await self._read_same_board()
 
     async def close(self) -> None:
-        """Nothing to let go of; relays stay as they are (a timed one drops by itself)."""
+        """Do nothing. Relays stay as they are (a timed one drops by itself)."""
 
     async def read(self) -> tuple[Reading, ...]:
         """Every named relay as the board reports it, 1 on, 0 off; raises DeviceError, also when another board than
@@ -157,7 +157,8 @@ class Relays:
 
 
 class NoRelays:
-    """In place of a relay board: the climate chamber enables heat and cold by itself, the cameras always have power.
+    """Stands in place of a relay board: the climate chamber enables heat and cold by itself, the cameras always have
+    power.
 
     A permission to heat is remembered for as long as it was given, so that the guard's rules compare the chamber with
     it; no wire follows it. camera_power always reads on."""
@@ -171,7 +172,7 @@ class NoRelays:
         self._until_ns: dict[str, int | None] = {}  # None: for good
 
     async def open(self) -> None:
-        """Nothing to connect to."""
+        """Do nothing: there is no device to connect to."""
 
     async def close(self) -> None:
         """Nothing to let go of."""
@@ -197,7 +198,7 @@ class NoRelays:
         self._until_ns[channel] = self._clock.now_ns() + to_ns(duration_s)
 
     async def make_safe(self) -> None:
-        """Nothing is permitted any more."""
+        """Withdraw every permission."""
         self._until_ns.clear()
 
     def _is_on(self, channel: str) -> bool:

@@ -28,7 +28,7 @@ PLACES: tuple[Role, ...] = get_args(Role)[:-1]
 
 
 class Calibration(Document):
-    """Of one sensor against a certificate.
+    """The calibration of one sensor against a certificate.
 
     T = t + offset_K + sum_k polynomial[k] * t**k, where t is what the instrument says, in degC. A calibrated value
     outside plausible_degC is no measurement. certificate: its number, and when (calibrated) it was made; uncertainty_K:
@@ -121,7 +121,7 @@ class Thermometers:
 
     @property
     def unit(self) -> int:
-        """Its number on the bus."""
+        """The module's number on the bus."""
         return self._unit.map.transport.unit
 
     @property
@@ -204,7 +204,7 @@ class ThermometerModules:
         """Nothing to let go of."""
 
     async def read(self) -> tuple[Reading, ...]:
-        """Of all modules; DeviceError when one cannot be read."""
+        """Read all modules; DeviceError when one cannot be read."""
         return tuple([reading for module in self.modules for reading in await module.read()])
 
 

@@ -164,7 +164,7 @@ class Laboratory:
 
     @property
     def axes(self) -> dict[str, FakeAxis]:
-        """Of the table, by name."""
+        """The axes of the table, by name."""
         return {name: each for name, each in self.fakes.items() if isinstance(each, FakeAxis)}
 
     @property
@@ -213,7 +213,7 @@ class Laboratory:
 
     @property
     def thermometer_modules(self) -> tuple[RtdModule, ...]:
-        """Of contact thermometers."""
+        """The modules of contact thermometers."""
         return cast("tuple[RtdModule, ...]", self.fakes["thermometers"])
 
     @property

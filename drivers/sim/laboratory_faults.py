@@ -521,8 +521,8 @@ class FaultSchedule:
             return dict(self._standing)
 
     def break_now(self, name: str, value: object, for_s: float | None) -> None:
-        """By hand; None: until it is mended. ConfigError when there is no such fault, or this laboratory cannot have
-        it. The end of one that was broken by hand before is forgotten."""
+        """Break something by hand; None: until it is mended. ConfigError when there is no such fault, or this
+        laboratory cannot have it. The end of one that was broken by hand before is forgotten."""
         if name not in self.known:
             raise ConfigError(f"there is no fault {name}")
         with self._lock:
@@ -532,7 +532,7 @@ class FaultSchedule:
                 self._ends[name] = self._push(self._laboratory.now_ns + to_ns(for_s), name, self.known[name].mended)
 
     def mend(self, name: str) -> None:
-        """By hand; ConfigError as in `break_now`."""
+        """Mend a fault by hand; ConfigError as in `break_now`."""
         if name not in self.known:
             raise ConfigError(f"there is no fault {name}")
         with self._lock:
@@ -549,7 +549,7 @@ class FaultSchedule:
             self._laboratory.advance(now_ns)
 
     def tick(self) -> None:
-        """In real time: what has become due; ConfigError when this laboratory cannot have it."""
+        """In real time, make what has become due happen; ConfigError when this laboratory cannot have it."""
         if not self._laboratory.is_virtual:
             with self._lock:
                 self._break_until(self._laboratory.now_ns)

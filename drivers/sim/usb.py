@@ -77,7 +77,7 @@ class FakeUsbDevice(Protocol):
 
     @property
     def unplugged(self) -> bool:
-        """Not on the bus."""
+        """Whether the device is not on the bus."""
         ...
 
     def control_transfer(

@@ -266,7 +266,7 @@ class TcpWire:
             self._connections.discard(connection)
 
     def unplug(self) -> None:
-        """As `close`, until it is plugged in again."""
+        """Close the wire until it is plugged in again."""
         self.close()
 
     def close(self) -> None:

@@ -33,7 +33,7 @@ def frame_bytes(pixel_format: PixelFormat, count: int) -> int:
 
 
 def significant_bits(pixel_format: PixelFormat) -> int:
-    """Of a sample."""
+    """The significant bits of a sample."""
     return int(pixel_format.removeprefix("Mono").removesuffix("Packed").removesuffix("p"))
 
 

@@ -62,7 +62,7 @@ class FoundCamera:
 
 
 def list_serial_ports() -> tuple[SerialPort, ...]:
-    """Those with hardware behind them, by address."""
+    """List the serial ports with hardware behind them, by address."""
     lasting = {path.resolve(): str(path) for path in _links("/dev/serial/by-id", "/dev/ximc")}
     found: list[SerialPort] = []
     for port in list_ports.comports():

@@ -1,6 +1,6 @@
 """Copies of finished sessions on another disk, read back before they count, and the deletion of what has such a copy.
 
-A copy grows as `NAME.part` beside its place: each file under its own name once it is complete and synced, so that a
+A copy grows as `NAME.part` next to its place: each file under its own name once it is complete and synced, so that a
 copy that was interrupted goes on behind the last file. Then all of it is read back from the disk and compared with what
 was read of the session, `archive.json` is written with the checksums, and the folder gets its name. The session itself
 takes a line in its notes. Nothing of a session that is being recorded is touched, or of one whose run is not over.
@@ -189,7 +189,8 @@ def _copy_file(source: Path, target: Path, report: Report) -> str:
             digest.update(block)
             written.write(block)
             report(len(block))
-        os.posix_fadvise(read.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # a night must not push out what a run needs
+        # A copied session must not push what a run needs out of the memory.
+        os.posix_fadvise(read.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         if not is_present:
             written.flush()
             os.fsync(written.fileno())

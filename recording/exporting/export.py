@@ -3,7 +3,7 @@
     OUT/README.txt                   what is where, and how cells are to be read
     OUT/session.json                 the metadata
     OUT/attachments/config.yaml ...  the attached files
-    OUT/steps.csv, OUT/events.csv    and OUT/notes.csv, what people said of it
+    OUT/steps.csv, OUT/events.csv    and OUT/notes.csv, the notes that people wrote
     OUT/frames.csv                   every frame with its role, set-point, temperatures and stages (or .parquet)
     OUT/telemetry/regulator.csv      one table per device (or .parquet), and camera_meta: the descriptions of all frames
     OUT/frames/000001.png, .txt      each frame in order of time, and its temperatures: "each captured frame also had
@@ -47,7 +47,7 @@ README = """What is here was exported from a recorded session of a thermal test 
 session.json              what the session is: recipe, camera, operator, version, start
 attachments/              configuration, recipe and target, as they were recorded
 steps.csv, events.csv     what was done, and what happened
-notes.csv                 what people said of it, if anybody did
+notes.csv                 the notes that people wrote about it, if there are any
 frames.csv (or .parquet)  every frame: its file, when, what for, set-point, temperatures, stages (columns below)
 telemetry/                one table for each device; camera_meta describes every frame
 originals/                the pictures of the thermal imager, if there is one, as it stored them
@@ -65,10 +65,10 @@ Frames   Columns of frames.csv: file (the image here, else the recorded segment 
          reading (NAME_degC, in degrees Celsius) and how old it was (NAME_age_s, in seconds); NAME_position_mm or
          NAME_position_deg of each stage, in millimetres or degrees, interpolated to the middle of the exposure.
 Texts    Cells of the CSV tables are safe for spreadsheets, also of a stranger's session. A text that a spreadsheet
-         would take for a formula (its first character, spaces aside, is one of = + - @) has an apostrophe (') before
-         it: take that away to have the text as it was recorded. Control characters and those that turn the direction
-         of writing are left out; tabs and line ends are spaces. Numbers are never changed. Parquet tables, session.json
-         and attachments have all texts as they were recorded.
+         would take for a formula (its first character, leading spaces not counted, is one of = + - @) has
+         an apostrophe (') before it: take that away to have the text as it was recorded. Control characters and those
+         that turn the direction of writing are left out; tabs and line ends are spaces. Numbers are never changed.
+         Parquet tables, session.json and attachments have all texts as they were recorded.
 """
 
 

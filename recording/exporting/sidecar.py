@@ -1,4 +1,4 @@
-"""What belongs to an exported frame, as a text file beside it and as a row of the index: the same facts in both."""
+"""What belongs to an exported frame, as a text file next to it and as a row of the index: the same facts in both."""
 
 from __future__ import annotations
 

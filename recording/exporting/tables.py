@@ -64,9 +64,9 @@ class CsvTable:
 
 
 def escape_cell(text: str) -> str:
-    """The text of a cell with an apostrophe before what a spreadsheet would take for a formula (= + - @ at its
-    beginning, spaces aside), and without control characters (tab and line feed become spaces): a session may come from
-    anybody."""
+    """Return the text of a cell with an apostrophe before what a spreadsheet would take for a formula (= + - @ at its
+    beginning, leading spaces not counted), and without control characters (tab and line feed become spaces): a
+    session may come from anybody."""
     plain = "".join(" " if char in "\t\n\r" else char for char in text if char in "\t\n\r" or not _is_control(char))
     return f"'{plain}" if plain.lstrip().startswith(_FORMULA) else plain
 

@@ -36,7 +36,7 @@ def _list_readings_topics(session: Session) -> dict[str, Topic]:
 
 def iterate_recorded_messages(session: Session) -> Iterator[RecordedMessage]:
     """The messages of the telemetry as `list_topics` has them: those of a device that was declared otherwise in a
-    part of the session are encoded anew."""
+    part of the session are encoded again."""
     forms = {name: make_batch_schema(name, each) for name, each in recorded_devices(session.telemetry_segments).items()}
     for path in session.telemetry_segments:
         for message in read_telemetry_messages(path, lambda channel: True):

@@ -1,8 +1,8 @@
 """The readings of a device as messages, in a schema made of the channels that it declares.
 
 Each device has a topic of its own, `/readings/NAME`, whose channel record says in its metadata which kind of device it
-is and what it measures, each by its own name and unit. A message has one double per channel and a quality beside it; a
-channel that was not read is NaN and ABSENT, so that no viewer draws it as 0. `remarks` repeats in full each reading
+is and what it measures, each by its own name and unit. A message has one double per channel and its quality; a channel
+that was not read is NaN and ABSENT, so that no viewer draws it as 0. `remarks` repeats in full each reading
 that the fields cannot carry: it has a reason, an instant of its own, or was not declared.
 """
 

@@ -21,7 +21,7 @@ class Hole:
     first, last: numbers of the segments that are missing; both None when only frames, or their descriptions, are, and
     last alone when their number is unknown. begin_ns, end_ns: the recorded data end and begin again at these
     instants, None at the begin and the end of the session. frames: how many are not there. excused: frames that the
-    recorder itself said it lost: such a stretch makes no session incomplete.
+    recorder itself reported as lost: such a stretch makes no session incomplete.
     """
 
     series: str

@@ -65,8 +65,8 @@ def name_frame_topics(channel: str) -> FrameTopics:
 
 @dataclass(frozen=True, slots=True)
 class FrameContext:
-    """What is known of a frame beside itself: when it was published, what for and at which set-point (NaN: unknown),
-    and the last reading of each temperature and position."""
+    """What is known of a frame besides its image: when it was published, what for and at which set-point (NaN:
+    unknown), and the last reading of each temperature and position."""
 
     published_ns: int
     role: str = ""

@@ -26,7 +26,7 @@ from thermostand.recording.format.layout import (
     make_segment_metadata,
 )
 
-MOST_MISSING = 10_000  # segments; a night has hundreds
+MOST_MISSING = 10_000  # segments; a session has hundreds
 
 
 class SegmentState(StrEnum):

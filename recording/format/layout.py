@@ -31,7 +31,7 @@ def explain_unknown_format(session: Mapping[str, str]) -> str:
         return ""
     if not text or (text.isdecimal() and len(text) <= _FORMAT_DIGITS and int(text) < FORMAT):
         return (
-            "was recorded by an earlier, unreleased version of thermostand; read it with that version, or record anew"
+            "was recorded by an earlier, unreleased version of thermostand; read it with that version, or record again"
         )
     return f"is of format {text[:20]!r}; this version of thermostand reads up to {FORMAT}"
 

@@ -1,4 +1,4 @@
-"""`session.json`: what a session is to have, stated by its recorder beside the segments.
+"""`session.json`: what a session is to have, stated by its recorder next to the segments.
 
 It is written when a recording begins, each time a segment is finished, when the plan is known, and once more when the
 recording ends, always as a whole. A recorder that is killed between a segment's last name and this file leaves a

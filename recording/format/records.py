@@ -231,7 +231,7 @@ def _check_times(head: ChunkHead, place: ChunkPlace) -> None:
 
 def _locate_messages(chunk: memoryview, wanted: Container[int]) -> list[tuple[int, int, int]]:
     """(channel id, offset, end) of each message record of the wanted channels in a chunk."""
-    # Every record of a night passes here, so the loop has no call but one.
+    # Every record of a session passes here, so the loop has no call but one.
     unpack = _MESSAGE_START.unpack_from
     found: list[tuple[int, int, int]] = []
     offset, size = 0, len(chunk)
@@ -285,7 +285,7 @@ def _read_attachment(file: BinaryIO, offset: int, length: int) -> Attachment:
 
 
 def read_frame_crcs(path: Path, places: Sequence[FramePlace]) -> list[int]:
-    """The CRCs that frames of one segment are said to have, by the heads of their chunks; no frame is read."""
+    """Read the CRCs that the heads of their chunks state for frames of one segment; no frame is read."""
     with convert_damage(path), path.open("rb", buffering=0) as file:
         return [_read_frame_head(file, place.chunk).crc for place in places]
 

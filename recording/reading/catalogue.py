@@ -1,4 +1,4 @@
-"""The sessions of a folder, from an index beside them: `.sessions.sqlite`.
+"""The sessions of a folder, from an index next to them: `.sessions.sqlite`.
 
 The index is made from the sessions and holds nothing else. An entry counts as long as the names, sizes and times of its
 session's files are those it was made of; all others are made again. An index that is lost, damaged, of another version
@@ -51,7 +51,7 @@ Report = Callable[[float, str], None]
 
 @dataclass(frozen=True, slots=True)
 class ListedSession:
-    """A session at a glance (`scan.Scan` has the meanings), with what people said of it.
+    """A session at a glance (`scan.Scan` has the meanings), with the notes that people wrote.
 
     start_ns: begin_ns as UTC, end_utc_ns: end_ns. run, files: words of Run and Files. state_text, lacks: in words.
     segments_json: those of `segments`, which a list does not show and so need not be read.

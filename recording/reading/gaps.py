@@ -119,7 +119,7 @@ def _list_names(hole: _Hole, channels: frozenset[str]) -> list[str]:
 
 
 def count_lost_frames(step_id: str, events: Iterable[Event]) -> int:
-    """How many frames the recorder itself said it lost in events that name this step, or none."""
+    """Return how many frames the recorder itself reported as lost in events that name this step; 0 when none."""
     of_it: list[Event] = []
     for event in events:
         steps = event.data.get("steps") if event.kind == FRAMES_DROPPED else []
@@ -129,8 +129,8 @@ def count_lost_frames(step_id: str, events: Iterable[Event]) -> int:
 
 
 def list_reported_blocks(events: Iterable[Event]) -> list[range]:
-    """The block ids of frames that the recorder itself said it lost: `blocks` of the events' data, pairs of the first
-    and the last. What is no such pair is left out: a session may be from anybody."""
+    """The block ids of frames that the recorder itself reported as lost: `blocks` of the events' data, pairs of the
+    first and the last. What is no such pair is left out: a session may be from anybody."""
     reported = [event.data.get("blocks") for event in events if event.kind == FRAMES_DROPPED]
     pairs = [pair for blocks in reported if isinstance(blocks, list) for pair in cast("list[object]", blocks)]
     return [range(first, last + 1) for first, last in map(_parse_pair, pairs) if 0 <= first <= last <= _LAST_BLOCK]

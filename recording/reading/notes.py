@@ -1,7 +1,7 @@
 """What people say of a session: notes and tags, and where it was archived, in a small file of its own, `notes.jsonl`.
 
 Lines are only ever added, each with who and when, in the form of the journal's: a CRC, then a JSON object. So a running
-session takes a note, too, and its recording is not touched. A line that was torn or damaged is left out, and said.
+session takes a note, too, and its recording is not touched. A partial or damaged line is left out, and reported.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Archived:
 
 @dataclass(frozen=True, slots=True)
 class SessionNotes:
-    """All that was said; `tags` in the order they were given first. damage, unended: what is lost of it, and what is no
-    line at its end, which was being written or is lost; "" when nothing is."""
+    """All notes and tags of a session; `tags` are in the order they were given first. damage: what is lost of them.
+    unended: bytes at the end that are no line, which was being written or is lost; "" when nothing is."""
 
     notes: tuple[Note, ...] = ()
     tags: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ class SessionNotes:
 
 
 def read_notes(directory: Path) -> SessionNotes:
-    """Of the session in `directory`; empty when nothing was said, or none of it can be read."""
+    """Read the notes of the session in `directory`; empty when there are none, or none can be read."""
     try:
         fd = os.open(directory / NOTES_NAME, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
@@ -118,7 +118,7 @@ def check_tag(tag: str) -> str:
 
 
 def _append(directory: Path, fields: Mapping[str, object]) -> None:
-    """One line, behind the last one; what was torn behind that is cut off.
+    """Append one line behind the last one; a partial line behind that is cut off.
 
     The folder is opened first and not through a symbolic link, so that nothing is ever written elsewhere. What the disk
     took of a line that it did not take whole is cut off again.

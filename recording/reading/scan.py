@@ -834,7 +834,7 @@ class _LostEnd:
 @dataclass(frozen=True, slots=True)
 class Shortage:
     """Captures that follow each other and are done with `missing` frames less than they say. begin_ns, end_ns: of the
-    steps. is_reported: the recorder itself said that it lost them."""
+    steps. is_reported: the recorder itself reported that it lost them."""
 
     step_ids: tuple[str, ...]
     missing: int
@@ -968,7 +968,7 @@ def _check_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -
 
 
 def _check_notes(path: Path) -> Iterator[SessionFinding]:
-    """What people said of the session."""
+    """Check the notes that people wrote about the session."""
     said = read_notes(path)
     if said.damage:
         yield _make_error(said.damage, NOTES_NAME)

@@ -234,7 +234,7 @@ class ScanBudget:
         self._false_bytes += size_bytes
 
     def allows(self, offset: int, claim: RecordHead, chunk: ChunkHead | None) -> bool:
-        """Whether the record at `offset` is worth being read; `chunk` is its head when it is one."""
+        """Whether the record at `offset` may be read within the scan budget; `chunk` is its head when it is one."""
         if self._false_bytes <= self._source.size + _FREE_BYTES:
             return True
         if self._false_bytes > _LIMIT_FACTOR * self._source.size + _LIMIT_BYTES:
@@ -274,7 +274,7 @@ def _is_compressed_start(data: bytes) -> bool:
 SECTOR_BYTES = 4096  # the largest of today's disks
 APART_NS = 10 * NS_PER_S
 """Chunks are in the order in which they were published, but for what was seconds late. Sessions that lie closer
-together than this, as those in virtual time may, are not told apart."""
+together than this, as those in virtual time may, are not distinguished."""
 
 
 class Span(NamedTuple):
@@ -596,7 +596,7 @@ class _SegmentScanner:
             self.found.damages.append(gap)
 
     def _is_table(self, begin: int) -> bool:
-        """Whether the table of frames begins there, behind the last of them, which is made anew."""
+        """Whether the table of frames begins there, behind the last of them, which is made again."""
         head = self._source.read(begin, len(_TABLE_HEAD) + RECORD.size)
         return head[:1] == _TABLE_HEAD[:1] and head[RECORD.size + 16 :].startswith(_TABLE_HEAD[1:])
 

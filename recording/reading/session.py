@@ -158,7 +158,7 @@ class Session:
         return found
 
     def believed(self, channel: str) -> ChannelColumn:
-        """As `readings`, without those that were recorded in doubt."""
+        """As `readings`, without those that were recorded as suspect (cause "doubt")."""
         times_ns, values = self.readings(channel)
         kept = ~np.isin(times_ns, self._uncertain.get(channel, []))
         return ChannelColumn(times_ns[kept], values[kept])
@@ -362,8 +362,8 @@ class _Unreadable(FileDamaged):
 
 def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
     """The session in `path`; SessionError when something of it is missing or was never finished, unless `incomplete`
-    takes the sentence that says what. Frames that were never acknowledged, or that the recorder itself said it lost,
-    are not missing."""
+    takes the sentence that says what. Frames that were never acknowledged, or that the recorder itself reported as
+    lost, are not missing."""
     session = Session.open(path)
     check_whole(session, incomplete)
     return session

@@ -58,7 +58,7 @@ from thermostand.recording.writing.segment import CHUNK_BYTES, FrameTable
 # segment's vote before the own and the own before an unfinished one's when they are equally many.
 
 _GREATEST = 999_999_999  # a number beyond is none that a recorder has given
-SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a night of hundreds
+SIBLINGS_PER_SERIES = 4  # enough for a vote, few enough for a session of hundreds
 SESSION_ID = "session_id"
 
 
@@ -245,7 +245,7 @@ def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salv
 
 
 def _update_manifest(directory: Path) -> Iterator[Salvaged]:
-    """`session.json` lists what has been salvaged; reported where it had to be made anew."""
+    """`session.json` lists what has been salvaged; reported where it had to be made again."""
     files = list_segments(directory)
     if any(file.state is SegmentState.RECORDING for file in files) or all(
         file.state is SegmentState.DAMAGED for file in files
@@ -279,7 +279,7 @@ def _remove_left_over(copy: Path) -> None:
 
 
 def _salvage_number(finished: Path, finished_too: bool, share: ShareProgress) -> Iterator[Salvaged]:
-    """The finished segment of a number first: the unfinished one beside it is compared with what it holds."""
+    """The finished segment of a number first: the unfinished one next to it is compared with what it holds."""
     part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
     has_part = part.is_file()
     if finished.is_file() and (finished_too or has_part) and not _is_sound(finished, share):

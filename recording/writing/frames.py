@@ -134,7 +134,7 @@ class FrameRecorder:
         return self._queue.qsize()
 
     def receive(self, item: Item) -> None:
-        """Queue a frame, or count it as lost when there is no room."""
+        """Queue a frame, or count it as lost when the queue is full."""
         if not self._taking:
             return
         self._surroundings.receive(item)

@@ -10,7 +10,7 @@ from thermostand.recording.format.images import FrameEncoding
 @dataclass(frozen=True, slots=True)
 class RecordingSettings:
     """How to record. `telemetry_commit_s` is on the stand's clock: on a virtual one VIRTUAL_COMMIT_S costs nothing
-    that a real night would lose and spares tens of thousands of disk syncs. A segment is closed at the first commit
+    that a real session would lose and spares tens of thousands of disk syncs. A segment is closed at the first commit
     after it has `segment_bytes` or `segment_s`, whichever is first. While the disk takes nothing, `waiting_messages`
     are kept in memory (100 MB or so); beyond that readings are dropped, and nothing else.
 

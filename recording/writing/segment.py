@@ -305,7 +305,7 @@ class Segment:
         return sealed
 
     def _merge(self) -> Sealed | None:
-        """The finished segment when it is now the copy with large chunks; None when the disk has no room for it, or
+        """The finished segment when it is now the copy with large chunks; None when the disk has no space for it, or
         gives back other bytes than it took: the file stays as it was committed."""
         try:
             copy = merge_chunks(self._part, self._finished, self._form.compression)

@@ -177,7 +177,7 @@ def find_next_number(folder: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class SeriesReply:
-    """What a call of a series came to; `error` beside the rest, for troubles are reported also when it failed."""
+    """What a call of a series came to; `error` next to the rest, for troubles are reported also when it failed."""
 
     result: object
     error: OSError | None

@@ -52,7 +52,7 @@ class PermitRenewer:
             await self.clock.sleep_until(due_ns)
 
     async def renew_once(self) -> None:
-        """Once: the relays compared, and armed while that is permitted, else stopped if running; DeviceError."""
+        """Compare the relays once; arm them while that is permitted, else stop the timer. DeviceError."""
         if self.permits.is_granted:
             mv_heat, mv_cool = (get_value(self.hub, f"{self.regulator.name}.{name}") for name in ("mv_heat", "mv_cool"))
             coils = await self.permits.arm(mv_heat, mv_cool)

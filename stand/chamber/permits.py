@@ -102,7 +102,7 @@ class Permits:
 
     @property
     def timer_s(self) -> float | None:
-        """So long after the last renewal the board itself switches heat and cold off; None without a board."""
+        """How long after the last renewal the board itself switches heat and cold off; None without a board."""
         return self._limits.hold_s if self._relays.has_timer else None
 
     @property
@@ -117,7 +117,7 @@ class Permits:
         self.permission, self.intrusions = Permission.GRANTED, 0
 
     def revoke(self) -> None:
-        """Nothing is armed from now on."""
+        """Stop arming: nothing is armed from now on."""
         self.permission = Permission.REVOKED
 
     def clear_intrusions(self) -> None:

@@ -162,7 +162,8 @@ _SHARE = 1e-3
 
 @contextmanager
 def open_view(*, is_virtual: bool = False) -> Generator[View]:
-    """On standard error, while inside. Of a run in virtual time a line comes at each tenth instead of each minute."""
+    """Show the run on standard error while inside. Of a run in virtual time a line comes at each tenth instead of each
+    minute."""
     if get_output().quiet:
         yield Silent()
     elif not sys.stderr.isatty():
@@ -193,18 +194,19 @@ class RunFollower:
         self._next_ns = 0
 
     def watch(self, hub: Hub) -> None:
-        """From before the run begins."""
+        """Watch from before the run begins."""
         hub.subscribe(self._follow)
 
     @asynccontextmanager
     async def follow_service(self, service: StandService, session: Path) -> AsyncGenerator[None]:
-        """Of a run in virtual time. No frame is looked at for its drift: that would take longer than the run."""
+        """Follow the service of a run in virtual time. No frame is looked at for its drift: that would take longer than
+        the run."""
         async with serve_by_socket(service, session):
             self._service = service
             yield
 
     def make_front(self, interface: Interface, target_text: str) -> Front:
-        """Of a run on the host's clock: all that the stand's file asks for."""
+        """Make the interface of a run on the host's clock: all that the stand's file asks for."""
 
         @asynccontextmanager
         async def answering(service: StandService, session: Path) -> AsyncGenerator[None]:
@@ -253,7 +255,7 @@ class Silent:
     """Errors only."""
 
     def show(self, moment: StatusSnapshot) -> None:
-        """Nothing."""
+        """Show nothing."""
 
     def tell(self, line: str) -> None:
         """An error at once."""
@@ -262,7 +264,8 @@ class Silent:
 
 
 class PlainLines:
-    """For a file or a pipe: a line when the run begins, and then each minute, or at each tenth in virtual time."""
+    """The view for a file or a pipe: a line when the run begins, and then each minute, or at each tenth in virtual
+    time."""
 
     def __init__(self, clock: Now, *, is_virtual: bool) -> None:
         self._clock = clock
@@ -286,7 +289,7 @@ class PlainLines:
         typer.echo(format_line(moment), err=True)
 
     def tell(self, line: str) -> None:
-        """At once."""
+        """Print the text at once."""
         typer.echo(escape_line(line), err=True)
 
 
@@ -307,7 +310,7 @@ class TerminalPanel:
             self.draw()
 
     def draw(self) -> None:
-        """Now."""
+        """Draw the view now."""
         if self._last is None:
             return
         text = Text("\n".join(format_panel(self._last)), no_wrap=True, overflow="ellipsis")

@@ -80,7 +80,7 @@ def _format_files(files: Mapping[Path, str]) -> Iterator[str]:
 
 
 def make_unit_name(stand: StandConfig) -> str:
-    """Of the service."""
+    """Make the name of the service's unit."""
     return f"thermostand-{re.sub(r'[^A-Za-z0-9_.-]+', '-', stand.name)}"
 
 

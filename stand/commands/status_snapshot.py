@@ -33,7 +33,7 @@ class RemoteStand:
         self._note_session(state)
 
     def events(self) -> list[EventData]:
-        """Since the last look, as the interface gives them."""
+        """The events since the last look, as the interface gives them."""
         found = self.server.request("GET", f"{API}/events?from={self._seq}&limit={_EVENTS}")
         answer = cast("EventData", found)
         self._seq = max(self._seq, cast("int", answer.get("seq", 0)))
@@ -101,7 +101,7 @@ class StatusSnapshot:
 
 
 def make_snapshot(state: StandState, drift_px: float | None = None) -> StatusSnapshot:
-    """Of a stand as its daemon tells it."""
+    """Make the snapshot of a stand from what its daemon reports."""
     offset_ns, run = state.utc_offset_ns, state.run
     held = describe_holds(state.reasons)
     setpoint_degC, air_degC, camera_degC = state.setpoint_degC, _get_value(state, AIR), _get_value(state, CAMERA)
@@ -168,7 +168,8 @@ def _get_value(state: StandState, channel: str) -> float | None:
 
 
 def compute_share_done(state: StandState) -> float | None:
-    """Of the run under way, by the time it has taken and will take; None when its end, or its begin, is not known."""
+    """Compute which share of the run under way is done, by the time it has taken and will take; None when its end, or
+    its begin, is not known."""
     run = state.run
     began_ns = next((each.began_ns for each in state.queue if each.state == "running"), None)
     if run is None or run.end_ns is None or began_ns is None or run.end_ns <= began_ns:

@@ -26,7 +26,7 @@ _MOST_APART_K = 10.0  # a chamber so far from its laboratory keeps its flap shut
 
 
 class MovementChecks:
-    """Of the devices that answer, by their names in `opened`; each says what it found."""
+    """Movement checks of the devices that answer, by their names in `opened`; each says what it found."""
 
     def __init__(self, assembly: Assembly, opened: set[str], add: Add) -> None:
         self._assembly = assembly

@@ -34,7 +34,7 @@ def get_record_files(config: Path) -> tuple[Path, Path]:
 
 
 def compute_digest(text: str) -> str:
-    """Of one text."""
+    """Compute the digest of one text."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 

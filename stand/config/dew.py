@@ -15,7 +15,7 @@ _A, _B_degC = 17.62, 243.12
 
 
 def compute_dew_point_degC(air_degC: float, humidity_percent: float) -> float:
-    """Of air at that temperature and relative humidity (above 0); NaN when either is."""
+    """The dew point of air at that temperature and relative humidity (above 0); NaN when either is."""
     if math.isnan(air_degC) or math.isnan(humidity_percent):
         return math.nan
     exponent = math.log(humidity_percent / 100) + _A * air_degC / (_B_degC + air_degC)

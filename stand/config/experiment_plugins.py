@@ -27,7 +27,7 @@ _AT_LEAST = {"frames": 1, "interval_s": 1e-6, "exposure_s": 1e-6}
 
 
 def list_experiments() -> list[str]:
-    """Of the experiments that other packages add."""
+    """List the experiments that other packages add."""
     return sorted({point.name for point in entry_points(group=GROUP)})
 
 

@@ -140,7 +140,7 @@ class Recipe(Document):
 
     @property
     def packages(self) -> tuple[str, ...]:
-        """Those of other people that the plan depends on, with their versions."""
+        """The packages of other people that the plan depends on, with their versions."""
         return tuple(sorted({experiment.package for experiment in self.experiments} - {""}))
 
     def _expand(self) -> Iterator[RecipeStep]:

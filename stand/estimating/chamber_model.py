@@ -46,7 +46,8 @@ class Response(Document):
     time_constant_s: float = Field(gt=0)
 
     def arrival_s(self, gap_K: float, level_K: float = BAND_K) -> float:
-        """From the step of the set-point until the air is within `level_K` of it, s; 0 when it is from the start."""
+        """How long from the step of the set-point until the air is within `level_K` of it, s; 0 when it is from the
+        start."""
         gap_K = abs(gap_K)
         if gap_K <= level_K:
             return 0.0
@@ -68,12 +69,12 @@ class ChamberModel(Document):
     camera_ramps: int = Field(default=0, ge=0)
 
     def arrival_s(self, from_degC: float, to_degC: float, level_K: float = BAND_K) -> float:
-        """From the step of the set-point until the air is within `level_K` of it, s."""
+        """How long from the step of the set-point until the air is within `level_K` of it, s."""
         response = self.heating if to_degC > from_degC else self.cooling
         return response.arrival_s(to_degC - from_degC, level_K)
 
     def settled_s(self, from_degC: float, to_degC: float) -> float:
-        """Until the camera has followed for two time constants after that, s; 0 when the air need not move."""
+        """How long until the camera has followed for two time constants after that, s; 0 when the air need not move."""
         arrival_s = self.arrival_s(from_degC, to_degC)
         return arrival_s + 2.0 * self.camera_time_constant_s if arrival_s > 0.0 else 0.0
 

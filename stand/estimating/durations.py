@@ -21,8 +21,8 @@ from thermostand.stand.estimating.chamber_model import ChamberModel
 
 
 def compute_move_s(stage: StageProfile, steps: float) -> float:
-    """From rest to rest over so many full steps, s: a trapezoid of speed, a triangle when it is short. A controller
-    that is set otherwise shows in the overhead."""
+    """The time from rest to rest over so many full steps, s: a trapezoid of speed, a triangle when it is short. A
+    controller that is set otherwise shows in the overhead."""
     way = abs(steps)
     slow = 1.0 / stage.acceleration + 1.0 / stage.deceleration  # s to start and stop, per step/s
     speed = min(stage.speed, math.sqrt(2.0 * way / slow))
@@ -38,7 +38,7 @@ class ConfiguredStand(KnownStand):
         self.boot_s = max((camera.boot_s for camera in config.cameras.values()), default=0.0)
 
     def set_point_way_s(self, from_degC: float, to_degC: float) -> float:
-        """As the stand's ramp goes."""
+        """The time of a set-point's way, as the stand's ramp goes."""
         return 60.0 * abs(to_degC - from_degC) / self._config.set_point_K_per_min
 
     def arrival_s(self, from_degC: float, to_degC: float, band_K: float) -> float | None:
@@ -53,14 +53,14 @@ class ConfiguredStand(KnownStand):
         return self._chamber.arrival_s(from_degC, to_degC) + slowing_s
 
     def move_s(self, axis: str, begin: float, end: float) -> float:
-        """As the driver moves: when not from below, past the end first, then up to it."""
+        """The time of a move as the driver moves: when not from below, past the end first, then up to it."""
         profile = self._axis(axis).stage
         below = end - profile.overshoot
         ways = (begin - below, profile.overshoot) if begin > below else (end - begin,)
         return sum(compute_move_s(profile, way / profile.unit_per_step) for way in ways)
 
     def to_home_s(self, axis: str, position: float) -> float:
-        """At the speed of homing."""
+        """The time to the home switch at the speed of homing."""
         stage = self._axis(axis).stage
         return abs(position) / stage.unit_per_step / stage.homing_speed
 
@@ -73,13 +73,13 @@ class ConfiguredStand(KnownStand):
         return ""
 
     def camera_fault(self) -> str:
-        """Of a stand without one."""
+        """The fault of a stand without a camera."""
         if self._config.cameras:
             return ""
         return "needs a camera, and this stand has none; name it under cameras in the stand's file"
 
     def supply_fault(self) -> str:
-        """Of a stand without relays."""
+        """The fault of a stand without relays."""
         if self._config.relays is not None:
             return ""
         return "no relay switches the cameras, which stay on: this stand has no relay board; leave it out"

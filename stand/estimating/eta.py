@@ -106,7 +106,7 @@ class Eta:
         return ends
 
     def within_s(self) -> float | None:
-        """By how much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
+        """How much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
         expected of each, for as many of their kind of work as are to come; no less than a minute. None before three
         are done, while the kinds that are still to take half of the time have not been seen, and when none is left."""
         left = self._count + Counter(() if self._running is None else (self._running.work,))

@@ -28,7 +28,7 @@ class PlanEstimate:
 
 
 def estimate_plan(plan: Sequence[PlannedStep], config: StandConfig, directory: Path) -> PlanEstimate:
-    """Of a plan whose session will lie in `directory`; ConfigError as price."""
+    """Estimate a plan whose session will lie in `directory`; ConfigError as price."""
     learned = load_learned_durations(directory)
     return PlanEstimate(price_plan(plan, config, learned), estimate_return_s(plan, config, learned))
 

@@ -130,8 +130,8 @@ class Guard:
         return "; ".join(lasting)
 
     def recording_ended(self) -> None:
-        """Nothing is recorded from now on. A hold for what was not on the disk in time ends with that, and its cause
-        may last."""
+        """Note that nothing is recorded from now on. A hold for what was not on the disk in time ends with that, and
+        its cause may last."""
         fault = self.held
         if fault is None or fault.rule != NOT_RECORDED or not fault.ends_itself or self.release is None:
             return

@@ -41,7 +41,7 @@ class HeatTotal:
 
 
 def limit_heat_energy(max_Wh_per_h: float, heater_W: float, regulator: str, permit: str) -> Rule:
-    """More heat within an hour than the chamber ever needs, regardless of the sensors."""
+    """Make the rule that trips on more heat within an hour than the chamber ever needs, regardless of the sensors."""
 
     def step(last: HeatTotal | None, readings: Readings, now_ns: int) -> tuple[HeatTotal | None, Fault | None]:
         if last is None:

@@ -305,7 +305,8 @@ def require_session_folder(recording: Recording) -> Rule:
 
 
 def require_recording_process(recording: Recording) -> Rule:
-    """Nothing will be recorded any more in this run: the process that writes the session was killed."""
+    """Make the rule that trips when nothing will be recorded any more in this run: the process that writes the session
+    was killed."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         ended = recording.writer_ended

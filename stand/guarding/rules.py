@@ -94,7 +94,7 @@ class Announcements:
 
 
 def list_safety_thermometers(config: StandConfig) -> tuple[str, ...]:
-    """Those with `role: safety`."""
+    """List the thermometers with `role: safety`."""
     return tuple(f"thermometers.{name}" for name, each in config.sensors.items() if each.is_safety)
 
 
@@ -104,7 +104,7 @@ def list_granite_channels(config: StandConfig) -> tuple[str, ...]:
 
 
 def list_vital_channels(config: StandConfig) -> tuple[str, ...]:
-    """Without a fresh reading of each of these there is no heat."""
+    """List the channels without whose fresh readings there is no heat."""
     return (PV, AIR, *list_granite_channels(config), *list_safety_thermometers(config))
 
 

@@ -36,7 +36,7 @@ class Suspicion:
     by: tuple[str, ...] = ()
 
     def words(self, pair: tuple[str, str]) -> str:
-        """As the end of a sentence that names both."""
+        """The diagnosis as the end of a sentence that names both."""
         if not self.suspect:
             return f"; whether {pair[0]} or {pair[1]} is wrong cannot be determined from what else is measured"
         if not self.by:

@@ -34,7 +34,8 @@ _UNKNOWN_S = 60.0  # without a reading; a longer gap leaves open what happened i
 
 
 class CameraEquilibrium:
-    """Of one camera; `is_lost` from `lose` until `wait_until_regained` has returned, or `forget`."""
+    """The thermal equilibrium of one camera; `is_lost` from `lose` until `wait_until_regained` has returned, or
+    `forget`."""
 
     def __init__(self, limits: EquilibriumSettings, hub: Hub, clock: Clock) -> None:
         self.is_lost = False
@@ -72,7 +73,7 @@ class CameraEquilibrium:
         self.is_lost = False
 
     def soaked_s(self) -> float | None:
-        """For how long the camera has been soaked since its equilibrium was lost; None when it need not be."""
+        """How long the camera has been soaked since its equilibrium was lost; None when it need not be."""
         return (self._clock.now_ns() - self._since_ns) / NS_PER_S if self.is_lost else None
 
     async def wait_until_regained(self, is_disturbed: Callable[[], bool]) -> None:

@@ -67,12 +67,12 @@ class Verdict:
 
     @property
     def settled(self) -> bool:
-        """Nothing is missing."""
+        """Whether nothing is missing."""
         return not self.missing
 
     @property
     def rates(self) -> str:
-        """As in `0.02 +- 0.02 K/min, 0.60 +- 0.11 mpx/min`."""
+        """The rates in words, as in `0.02 +- 0.02 K/min, 0.60 +- 0.11 mpx/min`."""
         return (
             f"camera {self.camera.per_min:+.3f} +- {COVERAGE * self.camera.uncertainty:.3f} K/min, "
             f"image {1e3 * self.drift.per_min:+.2f} +- {1e3 * COVERAGE * self.drift.uncertainty:.2f} mpx/min"

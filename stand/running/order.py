@@ -106,7 +106,7 @@ def read_optics_texts(config: StandConfig) -> dict[str, str]:
 
 
 def select_optics(config: StandConfig, texts: Mapping[str, str]) -> dict[str, str]:
-    """Those of them that are among the attachments of a session; built-in optics have none."""
+    """Select those that are among the attachments of a session; built-in optics have none."""
     simulated = () if config.simulation is None else config.simulation.cameras
     return {name: texts[name] for name in map(_OPTICS.format, simulated) if name in texts}
 

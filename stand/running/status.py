@@ -120,7 +120,7 @@ class StatusBoard:
                 pass
 
     def status(self) -> RunStatus:
-        """As it is now."""
+        """The status as it is now."""
         self._follow_state()
         now_ns, saved = self._clock.now_ns(), self._recorder.saved
         warning, fault = self._warning, self._latch.fault

@@ -125,7 +125,7 @@ class Daemon(Host):
         }
 
     def queue(self) -> tuple[QueuedRun, ...]:
-        """As Host."""
+        """See Host."""
         return self._orders.list_runs()
 
     def wake(self) -> None:
@@ -133,7 +133,7 @@ class Daemon(Host):
         self._wake.set()
 
     def leave(self) -> None:
-        """As soon as the stand is confirmed safe; may be called again."""
+        """Leave as soon as the stand is confirmed safe; may be called again."""
         if not self._extending:
             self._extending.append(asyncio.create_task(systemd.keep_extending()))
         self._orders.leaving = True
@@ -162,7 +162,7 @@ class Daemon(Host):
         self._start_task(self._reset_queue())
 
     async def serve(self, front: Front) -> None:
-        """Until `leave`; then the stand is safe. Raises what makes that impossible."""
+        """Serve until `leave`; then the stand is safe. Raises what makes that impossible."""
         async with AsyncExitStack() as stack:
             stack.push_async_callback(cancel_all, self._extending)
             stack.push_async_callback(self._keep.close, self.open_stand.shutdown_deadline)
@@ -459,7 +459,7 @@ class Daemon(Host):
         self.wake()
 
     def check_heat(self) -> None:
-        """As Host."""
+        """See Host."""
         recorder = self.record.recorder
         if recorder is None or recorder.folder_lost or recorder.writer_ended:
             raise Conflict("nothing is recorded now, and there is no heat without a recording; see the last events")

@@ -80,7 +80,7 @@ class IdleLog:
 
     @property
     def recorder(self) -> Recorder | None:
-        """Of the record under way."""
+        """The recorder of the record under way."""
         return None if self._now is None else self._now.recorder
 
     def is_of_today(self) -> bool:
@@ -223,11 +223,11 @@ class _Tap(Hub):
         self._hub.publish(item)
 
     def close(self) -> None:
-        """Nothing passes any more."""
+        """Let nothing pass any more."""
         for recorder in self._recorders:
             self._hub.unsubscribe(recorder)
 
     def give(self, item: Item) -> None:
-        """To those who record, and nobody else."""
+        """Give an item to those who record, and nobody else."""
         for recorder in self._recorders:
             recorder(item)

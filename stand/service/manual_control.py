@@ -69,7 +69,7 @@ class ManualControl:
     # As drivers.devices.kinds.Hands.
 
     def device(self, name: str) -> Any:
-        """Once the interlock has nothing against it."""
+        """Get the device once the interlock has nothing against it."""
         self._stand.interlock.check()
         return self._stand.devices.every[name]
 
@@ -98,11 +98,11 @@ class ManualControl:
         return self._run_then_read(name, self._stand.table.stop(name))
 
     def home_axis(self, name: str) -> Work:
-        """And tell how far its scale was off."""
+        """Home the axis and report how far its scale was off."""
         return self._run_then_read(name, self._stand.table.check_home(name))
 
     def supply_cameras(self, *, is_on: bool) -> Work:
-        """Of all."""
+        """Switch the supply of all cameras."""
         supply = self._stand.imaging.supply
         return supply.switch_on() if is_on else supply.switch_off()
 

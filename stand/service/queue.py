@@ -151,7 +151,7 @@ def finish(
 
 
 def halt(directory: Path, reason: str) -> None:
-    """Nothing is begun before an operator says so."""
+    """Halt the queue: nothing is begun before an operator resets it."""
     with change_queue(directory) as draft:
         draft.set(halted=draft.queue.halted or reason)
 

@@ -36,8 +36,8 @@ _SHOWN = 50  # runs that have ended
 
 
 class RunQueue:
-    """Of the daemon that has `open_stand`. texts: config.yaml, target.yaml, optics of simulated cameras and the record
-    of `stand check` where there is one, as they were when it began.
+    """The queue of the daemon that has `open_stand`. texts: config.yaml, target.yaml, optics of simulated cameras and
+    the record of `stand check` where there is one, as they were when it began.
 
     queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
     """
@@ -115,7 +115,7 @@ class RunQueue:
         await self._change(queue.move, number, to)
 
     async def resume(self, session: str) -> QueueEntry:
-        """Its run is the next one."""
+        """Put the session first in the queue: its run is the next one."""
         folder = await self.reading.call(self.find_session, session)
         try:
             is_whole = await self.repair.call(is_complete, folder)

@@ -143,7 +143,7 @@ class NoteRequest(Document):
 
 
 class StandService(Served):
-    """Of the open stand that `host` has: for days, or for one run."""
+    """The service of the open stand that `host` has: for days, or for one run."""
 
     def __init__(self, host: Host) -> None:
         assembly = host.open_stand.assembly
@@ -153,7 +153,7 @@ class StandService(Served):
         self._assembly = assembly
 
     def state(self) -> StandState:
-        """As it is now."""
+        """The state as it is now."""
         assembly, run, host = self._assembly, self._run, self.host
         changes = host.get_state_fields()
         if run is not None:
@@ -178,13 +178,13 @@ class StandService(Served):
         return self.host.devices()
 
     async def list_simulated_faults(self) -> SimulatedFaults:
-        """Of the simulated laboratory."""
+        """List the faults of the simulated laboratory."""
         from thermostand.stand.running.simulated_faults import list_simulated_faults
 
         return await list_simulated_faults(self._assembly)
 
     def make_answer(self, verb: str, text: str) -> Done:
-        """With what holds the run now, and what is still under way."""
+        """Make an answer with what holds the run now, and what is still under way."""
         stand = self._assembly.stand
         reasons, moving = tuple(sorted(stand.gate.reasons)), tuple(stand.motions.texts)
         return Done(verb=verb, text=text, reasons=reasons, moving=moving)
@@ -335,7 +335,7 @@ class StandService(Served):
 
     @property
     def shutdown_deadline(self) -> ShutdownDeadline:
-        """Of a stand that is closed."""
+        """The shutdown deadline of a stand that is closed."""
         return self._open_stand.shutdown_deadline
 
     @property

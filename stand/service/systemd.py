@@ -27,7 +27,7 @@ class StatusNotice:
         self._last_text = ""
 
     def tell(self, text: str) -> None:
-        """In a few words, as `systemctl status` shows them."""
+        """Report the status in a few words, as `systemctl status` shows them."""
         if text != self._last_text:
             self._last_text = text
             notify_systemd(f"STATUS={text}")

@@ -64,7 +64,7 @@ class AlertTracker:
 
     @property
     def is_well(self) -> bool:
-        """Nothing is wrong; may be asked from another thread."""
+        """Whether nothing is wrong; may be asked from another thread."""
         return not any(cause in _BAD and key != "nearly full" for cause, key in tuple(self._open))
 
     def receive(self, event: Event, now_ns: int) -> list[AlertMessage]:

@@ -145,7 +145,7 @@ class _UnixConnection(http.client.HTTPConnection):
         self._limit_s = timeout_s
 
     def connect(self) -> None:
-        """As HTTPConnection."""
+        """Connect as HTTPConnection does."""
         daemon = socket.socket(socket.AF_UNIX)
         # The kernel's own time-out: with Python's, a full queue would be an error at once.
         seconds, rest_s = divmod(self._limit_s, 1.0)

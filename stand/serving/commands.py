@@ -165,7 +165,7 @@ class Served(ABC):
 
     @abstractmethod
     def state(self) -> StandState:
-        """As it is now."""
+        """The state as it is now."""
 
     @abstractmethod
     def plan(self) -> tuple[PlanStep, ...]:

@@ -63,7 +63,8 @@ class Columns:
     marks: tuple[Mark, ...]
 
     def as_json(self) -> dict[str, object]:
-        """As the interface answers; NaN becomes None, and `high` holds only channels that differ from `low`."""
+        """The history as the interface answers it; NaN becomes None, and `high` holds only channels that differ from
+        `low`."""
         different = [name for name in self.low if not np.array_equal(self.low[name], self.high[name], equal_nan=True)]
         return {
             "from_ns": self.from_ns,
@@ -93,7 +94,7 @@ class _Ring:
         self._high: Float = np.empty((0, cells), np.float32)
 
     def resize(self, rows: int) -> None:
-        """For so many channels."""
+        """Resize the arrays for so many channels."""
         more = np.full((rows - len(self._low), self.cells), np.inf, np.float32)
         self._low, self._high = np.concatenate((self._low, more)), np.concatenate((self._high, -more))
 
@@ -196,7 +197,7 @@ class History:
                 pass
 
     def channels(self) -> tuple[str, ...]:
-        """Those that there are, in the order of their first reading."""
+        """The channels that there are, in the order of their first reading."""
         return tuple(self._rows)
 
     def get_last_ns(self, channel: str) -> int | None:
@@ -253,7 +254,7 @@ class History:
                 return
 
     def reference(self, camera: str, time_ns: int) -> None:
-        """From then on the drift of this camera counts from another frame."""
+        """Count, from then on, the drift of this camera counts from another frame."""
         self._references.append(Mark(time_ns, "reference", camera, ""))
 
     def columns(self, from_ns: int, to_ns: int, points: int = 1200, channels: Collection[str] | None = None) -> Columns:

@@ -82,7 +82,7 @@ class PageData:
         self._items.append(item)
 
     def close(self) -> None:
-        """Nothing more is taken from the hub."""
+        """Take nothing more from the hub."""
         self._hub.unsubscribe(self._follow)
 
     def drift_px(self) -> float | None:
@@ -93,7 +93,7 @@ class PageData:
     # From here on: in the thread that serves clients.
 
     async def run(self, session: Callable[[], str]) -> None:
-        """Until cancelled: keep the history, look at frames. session: the folder of the run under way, "" for none."""
+        """Until cancelled, keep the history, look at frames. session: the folder of the run under way, "" for none."""
         self._session = session
         try:
             async with asyncio.TaskGroup() as tasks:

@@ -32,9 +32,9 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """For setting up. histogram: shares of the pixels in 64 equal parts of the range. saturated: share of pixels at its
-    end; dark: at its beginning. The rest is None without markers. edge_px: mean width of the markers' edges, 10 to
-    90 %. tilt_deg: of the target against the image, from its foreshortening, None when that is too small to tell.
+    """Values for setting up. histogram: shares of the pixels in 64 equal parts of the range. saturated: share of pixels
+    at its end; dark: at its beginning. The rest is None without markers. edge_px: mean width of the markers' edges, 10
+    to 90 %. tilt_deg: of the target against the image, from its foreshortening, None when that is too small to tell.
     keystone_x_percent: by how much larger the right end of the target appears than the left one, keystone_y_percent:
     the lower than the upper; 0 when camera and target face each other. roll_deg: of the target in the image."""
 

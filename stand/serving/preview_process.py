@@ -17,7 +17,7 @@ LEFT_NAME = "stand-look-left"  # of a process whose daemon has gone
 
 
 def make_previewer(target_text: str) -> Previewer:
-    """For a target; ConfigError when its text is none."""
+    """Make a previewer for a target; ConfigError when its text is none."""
     import cv2
 
     from thermostand.foundation.documents import parse_document
@@ -60,5 +60,5 @@ def load_recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]
 
 
 def prepare() -> None:
-    """As a process of its own."""
+    """Prepare a process of its own."""
     lower_priority()

@@ -30,7 +30,7 @@ class DriftPoint:
 
 @dataclass(frozen=True, slots=True)
 class SessionDrift:
-    """Of one camera, in order of time. trouble: why frames had no drift, "" when all had."""
+    """The drift of one camera, in order of time. trouble: why frames had no drift, "" when all had."""
 
     camera: str
     points: tuple[DriftPoint, ...]
@@ -39,7 +39,8 @@ class SessionDrift:
 
 @dataclass(frozen=True, slots=True)
 class RecalledReference:
-    """Of one camera of an interrupted run: the frame that drift counts from, and the role of its last frame."""
+    """The reference of one camera of an interrupted run: the frame that drift counts from, and the role of its last
+    frame."""
 
     shot: FrameShot
     last_role: str

@@ -1,4 +1,4 @@
-"""A datasheet's numbers are right within what they claim, agree from night to night, and say how they came to be."""
+"""A datasheet's numbers are right within what they claim, agree between sessions, and say how they came to be."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_of_two_sessions_each_counts_and_their_difference_is_stated():
         assert BETWEEN_SESSIONS in {line.source for line in pooled_one.contributions}
     page = render_datasheet_page(sheet)
     assert "From 2 sessions" in page
-    assert "One night was recorded" not in page
+    assert "One session was recorded" not in page
     assert len(json.loads(serialise_datasheet(sheet))["nights"]) == 2
 
 

@@ -161,7 +161,7 @@ def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analy
         f"{analysed[2].rms_before_px[1]:.3f}",
         "night-1", "thermal-cycle",
         "34 (4 reference, 14 fit, 12 validation, 4 warm-up); 1 of them cannot be used",
-        "1 set aside (1 saturated)",
+        "1 left out (1 saturated)",
         "<td>found 3 of 54 markers &lt;of&gt; paper-9x6</td><td>night-1</td><td>1</td><td>33</td>",
         "camera 25.00 to 67.00 °C",
         "<td>granite along the axis</td><td>25.17</td><td>4.05</td><td>-48.61</td><td>7.82</td>",
@@ -232,9 +232,9 @@ def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: ReportN
         (numbers.model, "is not known", ""),  # of the paper's form
     ):
         page = render_numbers(replace(numbers, model=model))
-        assert (f"How well nights repeat {said}" in page) == bool(said)
-        assert ("How well nights repeat" in page) == bool(said)
-        assert ("added by a night" in page) == bool(row)
+        assert (f"How well sessions repeat {said}" in page) == bool(said)
+        assert ("How well sessions repeat" in page) == bool(said)
+        assert ("added by a session" in page) == bool(row)
         assert row in page
 
 

@@ -252,7 +252,7 @@ def test_nights_that_agree_make_it_smaller_and_nights_that_do_not_larger():
     found = estimate_between_sessions(left_px, off_px2)
     assert not found.is_assumed
     assert found.sigma_px[0] > 2 * agreeing[0]
-    assert "as 2 nights show" in found.text
+    assert "as 2 sessions show" in found.text
 
 
 def test_with_many_nights_it_is_what_they_show():

@@ -241,7 +241,8 @@ def _draw_scale_bar(axes: Axes, image_size: tuple[int, int], length_px: float, t
 
 
 def choose_enlargement(long_px: float, width: int) -> tuple[float, float]:
-    """By how much an arrow of this length is drawn longer, a round number, and a round length for the bar beside it."""
+    """Choose by how much an arrow of this length is drawn longer, a round number, and a round length, px, for the bar
+    next to it."""
     wanted = _LONGEST_ARROW * width / max(long_px, 1e-9)
     power = 10 ** math.floor(math.log10(wanted))
     scale = next(step * power for step in (5, 2, 1) if step * power <= wanted)

@@ -1,4 +1,4 @@
-"""The figures of the pages beside the report: of a calibration (blue is x, orange is y), of a datasheet, and of a
+"""The figures of the pages besides the report: of a calibration (blue is x, orange is y), of a datasheet, and of a
 validation in three dimensions (blue is before, orange after compensation, as in the paper)."""
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def draw_residual_sizes(calibration: CameraCalibration) -> Figure:
 
 
 def draw_normalised_histogram(calibration: CameraCalibration) -> Figure:
-    """Residuals over their detection sigma, beside the normal distribution they would have if that were all."""
+    """Draw the residuals over their detection sigma, and the normal distribution they would have if that were all."""
     adjustment = calibration.adjustment
     values = adjustment.normalised[adjustment.used]
     reach = max(4.0, float(np.abs(values).max()))

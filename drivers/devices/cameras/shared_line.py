@@ -44,7 +44,7 @@ class CameraLine:
 
 
 def compute_line_shares(cameras: Mapping[str, CameraSettings]) -> tuple[CameraLine, ...]:
-    """Of each GigE camera, in the order of the stand's file."""
+    """Compute the share of the line of each GigE camera, in the order of the stand's file."""
     lines: list[CameraLine] = []
     for name, camera in cameras.items():
         settings = add_line_share(camera, cameras.values())

@@ -87,7 +87,7 @@ class Ascii2Language(ChamberLanguage):
         self._way_degC: tuple[float, float] | None = None  # of the last set-point: from where, to where
 
     def state(self) -> ChamberState:
-        """Of I."""
+        """Parse the state from the reply to I."""
         values, digits = self._read()
         nominal = 0 if self._settings.order == "nominal_actual" else 1
         return ChamberState(

@@ -91,7 +91,7 @@ class CtsLanguage(ChamberLanguage):
             self.not_reported = f"{', '.join(unasked)} (not asked); {self.not_reported}"
 
     def state(self) -> ChamberState:
-        """Of A0, S, and F when there is an error."""
+        """Parse the state from the replies to A0, S, and F when there is an error."""
         actual, nominal = self.client.query(*self._asked("A0", 14, self._temperatures))
         flags, code = self.client.query(*self._asked("S", 10, self._flags))
         alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
@@ -113,7 +113,7 @@ class CtsLanguage(ChamberLanguage):
         self.client.send(*self._asked(f"a0 {degC:05.1f}", 1, _expecting("a")))
 
     def humidity_off(self) -> None:
-        """Its channel differs from unit to unit."""
+        """Switch humidity control off; its channel differs from unit to unit."""
         raise Refused(self._name, "humidity is on, and can only be switched off at the panel: do so, and start again")
 
     def run(self, on: bool) -> None:

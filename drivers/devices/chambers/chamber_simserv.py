@@ -84,11 +84,11 @@ class SimservLanguage(ChamberLanguage):
         self._settings = settings
 
     def identity(self) -> str:
-        """Its type and serial number."""
+        """Read the unit's type and serial number."""
         return f"{self._text(99997, _TYPE)}, serial number {self._text(99997, _SERIAL_NUMBER)}"
 
     def limits_degC(self) -> tuple[float, float] | None:
-        """Of 11007 and 11009."""
+        """Parse the limits from the replies to 11007 and 11009."""
         low_degC, high_degC = sorted((self._number(11007, _TEMPERATURE), self._number(11009, _TEMPERATURE)))
         return low_degC, high_degC
 

@@ -150,7 +150,7 @@ class ThermalImager:
             self._begin(listed)
 
     async def close(self) -> None:
-        """Nothing to let go of but a thread; may be called twice."""
+        """Release the thread; may be called twice."""
         lane, self._worker = self._worker, None
         if lane is not None:
             lane.close()

@@ -386,8 +386,8 @@ def _name_errors(halting: int) -> str:
 
 
 class NoFlap:
-    """In place of a flap: cameras see the target all the time, and opening and closing are done at once. What was
-    commanded last is remembered, nothing is read."""
+    """Stands in place of a flap: cameras see the target all the time, and opening and closing are done at once. What
+    was commanded last is remembered, nothing is read."""
 
     identity = None
 
@@ -396,29 +396,29 @@ class NoFlap:
         self.is_shut = True
 
     async def open(self) -> None:
-        """Nothing to connect to."""
+        """Do nothing: there is no device to connect to."""
 
     async def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: there is nothing to release."""
 
     async def read(self) -> tuple[Reading, ...]:
-        """Nothing is read."""
+        """Return nothing: there is nothing to read."""
         return ()
 
     async def move_open(self) -> None:
-        """Nothing moves."""
+        """Note the command; nothing moves."""
         self.is_shut = False
 
     async def move_closed(self) -> None:
-        """Nothing moves."""
+        """Note the command; nothing moves."""
         self.is_shut = True
 
     async def make_safe(self) -> None:
-        """As closed."""
+        """Do the same as for closed."""
         self.is_shut = True
 
     def allow(self) -> None:
-        """Nothing was barred."""
+        """Do nothing: nothing was barred."""
 
 
 class _BackendModule(Protocol):

@@ -396,7 +396,7 @@ _POWER_OFF_ENABLED = 0x2
 
 
 def read_power_off_s(client: XimcClient) -> float | None:
-    """After how long at rest it switches its motor off, None for never; blocking. Unreachable, GarbledReply."""
+    """Read after how long at rest it switches its motor off, None for never; blocking. Unreachable, GarbledReply."""
     _, _, delay_s, _, flags = _POWER.unpack(client.query("gpwr", _POWER.size))
     return float(delay_s) if flags & _POWER_OFF_ENABLED else None
 
@@ -406,7 +406,7 @@ _THOUSANDTHS = 0x1  # of MoveFlags: the speeds are divided by 1000
 
 
 def read_speed_steps_s(client: XimcClient) -> float:
-    """At which it moves, full steps/s; blocking. Unreachable, GarbledReply."""
+    """Read the speed at which it moves, full steps/s; blocking. Unreachable, GarbledReply."""
     speed, *_, flags = _MOVE.unpack(client.query("gmov", _MOVE.size))
     return speed / 1000 if flags & _THOUSANDTHS else float(speed)
 

@@ -98,7 +98,7 @@ class HeatModule:
             await self._prepare()
 
     async def close(self) -> None:
-        """Nothing to let go of; a module that is left alone goes to its safe value."""
+        """Do nothing: there is nothing to release. A module that is left alone goes to its safe value."""
 
     async def read(self) -> tuple[Reading, ...]:
         """output (mA, what it gives), tripped; while it heats those of the law's last exchange, STALE when the law's

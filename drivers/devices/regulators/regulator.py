@@ -77,7 +77,7 @@ class Regulator:
             await self._start_up()
 
     async def close(self) -> None:
-        """Nothing to let go of: the bus belongs to the stand; control continues in the unit."""
+        """Do nothing: the bus belongs to the stand; control continues in the unit."""
 
     async def read(self) -> tuple[Reading, ...]:
         """pv, sp (degC), mv_heat, mv_cool (%), running, fault (1 or 0); raises DeviceError.

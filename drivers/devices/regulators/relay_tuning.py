@@ -93,7 +93,7 @@ def begin(set_point_degC: float, output_percent: float, now_ns: int) -> Tuning:
 
 
 def amplitude_percent(bias_percent: float, settings: TuningSettings, law: Law) -> float:
-    """Of the output: both levels within 0 and the law's upper limit."""
+    """The amplitude of the output: both levels within 0 and the law's upper limit."""
     return max(0.0, min(settings.amplitude_percent, bias_percent, law.highest_percent - bias_percent))
 
 

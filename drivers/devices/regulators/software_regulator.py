@@ -94,7 +94,7 @@ class SoftwareRegulator:
 
     @property
     def identity(self) -> Identity | None:
-        """Of what it heats by, where that is a device of its own."""
+        """The identity of what it heats by, where that is a device of its own."""
         return self._heat.identity
 
     @property

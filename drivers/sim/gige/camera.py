@@ -168,12 +168,12 @@ class CameraThermometers(Protocol):
 
     @property
     def sensor_degC(self) -> float:
-        """Of the sensor chip."""
+        """The temperature of the sensor chip."""
         ...
 
     @property
     def body_degC(self) -> float:
-        """Of the housing."""
+        """The temperature of the housing."""
         ...
 
 

@@ -226,7 +226,7 @@ class SparseMemory:
         return {page: bytearray(held) for page, held in self._pages.items()}
 
     def restore(self, copy: dict[int, bytearray]) -> None:
-        """As it was when the copy was made."""
+        """Set the registers as they were when the copy was made."""
         self._pages = {page: bytearray(held) for page, held in copy.items()}
 
 

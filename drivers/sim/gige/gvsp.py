@@ -50,7 +50,7 @@ class PixelFormat(IntEnum):
 
     @property
     def symbol(self) -> str:
-        """Its name of the PFNC, Mono12Packed."""
+        """The format's name in the PFNC, such as Mono12Packed."""
         return self.name.capitalize().replace("packed", "Packed")
 
     def size_bytes(self, pixels: int) -> int:

@@ -98,7 +98,8 @@ def make_rest(position: float) -> Path:
 
 
 def plan_path_to(position: float, speed: float, target: float, pace: Pace) -> Path:
-    """From a moving start to rest at `target`; turns round when the target lies behind or too near to stop."""
+    """Plan the path from a moving start to rest at `target`; turns round when the target lies behind or too near to
+    stop."""
     if pace.speed == 0:
         return plan_path_onward(position, speed, 1, pace)
     halt = position + speed * abs(speed) / (2 * pace.decel)
@@ -117,7 +118,7 @@ def plan_path_to(position: float, speed: float, target: float, pace: Pace) -> Pa
 
 
 def plan_path_onward(position: float, speed: float, direction: int, pace: Pace) -> Path:
-    """From a moving start to the top speed in `direction` (1 or -1), for ever."""
+    """Plan the path from a moving start to the top speed in `direction` (1 or -1), for ever."""
     if speed * direction < 0:
         halt = plan_path_to_halt(position, speed, pace.decel)
         return _join(halt, plan_path_onward(halt.end, 0.0, direction, pace))

@@ -191,7 +191,7 @@ class Stepper:
         return travel.path.at(travel.elapsed_s(time_ns))[0]
 
     def speed(self, time_ns: int) -> float:
-        """Its rate, steps/s."""
+        """The motor's present rate, steps/s."""
         travel = self.travel(time_ns)
         return travel.path.at(travel.elapsed_s(time_ns))[1]
 

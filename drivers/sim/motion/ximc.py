@@ -88,7 +88,7 @@ class Settings:
         )
 
     def pace(self) -> Pace:
-        """Of MOVE, MOVR, LEFT, RIGT, LOFT and SSTP."""
+        """The speed and acceleration of MOVE, MOVR, LEFT, RIGT, LOFT and SSTP."""
         speed, micro_speed, *_, flags = self._fields("mov")
         return self._pace(speed, micro_speed, 1000 if flags & table.MOVE_THOUSANDTHS else 1)
 

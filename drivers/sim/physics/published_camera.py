@@ -123,7 +123,7 @@ class PublishedCamera:
 
     @property
     def body_degC(self) -> float:
-        """Of its housing."""
+        """The temperature of its housing."""
         return float(self._degC[BODY])
 
     @property

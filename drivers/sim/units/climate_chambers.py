@@ -85,7 +85,7 @@ class FakeClimateChamber:
         return self._plant.chamber_degC if self.stuck_degC is None else self.stuck_degC
 
     def now(self) -> AbstractContextManager[int]:
-        """Its state at the clock's present time."""
+        """Compute the chamber's state at the clock's present time."""
         return self._plant.at(self._clock)
 
     def set(self, degC: float) -> bool:

@@ -36,7 +36,7 @@ class Unit(Protocol):
 
     @property
     def unit(self) -> int:
-        """Its address, 1..255."""
+        """The unit's address, 1..255."""
         ...
 
     def handle(self, pdu: bytes) -> bytes | None:

@@ -43,11 +43,11 @@ class Relay:
     until_ns: int | None = None
 
     def closed_at(self, time_ns: int) -> bool:
-        """Its state at a time after the command."""
+        """Whether the contact is closed at a time after the command."""
         return self.closed if self.until_ns is None or time_ns < self.until_ns else not self.closed
 
     def closed_share(self, time_ns: int, dt_ns: int) -> float:
-        """Of the dt_ns from a time after the command on."""
+        """The closed share of the dt_ns from a time after the command on."""
         if self.until_ns is None:
             return float(self.closed)
         share = min(1.0, max(0.0, (self.until_ns - time_ns) / dt_ns))

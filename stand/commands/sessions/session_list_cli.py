@@ -134,7 +134,7 @@ def _save(directory: Path, add: Callable[..., None]) -> None:
 
 
 def get_user_name() -> str:
-    """Of who gives the command."""
+    """Get the name of the user who gives the command."""
     try:
         return pwd.getpwuid(os.getuid()).pw_name
     except KeyError:

@@ -66,14 +66,14 @@ class Complete:
 
 @dataclass(frozen=True, slots=True)
 class Sleep:
-    """Nothing is to be done before that instant."""
+    """Sleep: nothing is to be done before that instant."""
 
     until_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Until nothing holds the run."""
+    """Wait until nothing holds the run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class ContinueSoak:
 
 @dataclass(frozen=True, slots=True)
 class Equilibrate:
-    """Until the camera is in equilibrium again."""
+    """Wait until the camera is in equilibrium again."""
 
 
 @dataclass(frozen=True, slots=True)

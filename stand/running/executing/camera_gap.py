@@ -170,7 +170,7 @@ def explain_possible_power_loss(
 
 
 def load_camera_history(session: Session) -> CameraHistory:
-    """By what is recorded."""
+    """Load the camera's history from the recording."""
     boot_id = lost = ""
     events = [
         event for event in session.events() if event.kind in (CAMERA_EQUILIBRIUM_LOST, CAMERA_EQUILIBRIUM, *RUN_BEGINS)

@@ -43,7 +43,7 @@ async def keep_fixed_plan(decide: Decide) -> Decision:
 
 
 class Decider:
-    """Of the run whose session is in `directory`. decides: is called in a process of its own."""
+    """Decides for the run whose session is in `directory`. decides: is called in a process of its own."""
 
     def __init__(self, directory: Path, clock: Clock, decides: DecideFunction) -> None:
         self._directory = directory

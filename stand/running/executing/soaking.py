@@ -56,8 +56,8 @@ class SoakRunner:
                 await self._save_progress(soak, now_ns, soaked_ns, is_over=has_ended or soaked_ns == whole_ns)
 
     def flags(self) -> tuple[str, ...]:
-        """Of a frame that is taken now: whether the last soak has not brought the chamber into its band, or the chamber
-        has left it since, as one that overshoots does after a soak that was too short."""
+        """The flags of a frame that is taken now: whether the last soak has not brought the chamber into its band, or
+        the chamber has left it since, as one that overshoots does after a soak that was too short."""
         chamber_degC, band_K = self._state.set_up.chamber_degC, self._state.band_K
         if self._state.is_unsettled:
             return (UNSETTLED,)

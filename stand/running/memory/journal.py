@@ -127,7 +127,8 @@ class Journal:
         await self._wait_for_commit()
 
     def note(self, entry: JournalEntry) -> None:
-        """As `write`, without waiting for the disk; its line comes before those of later calls. Nothing once closed."""
+        """Write as `write` does, without waiting for the disk; its line comes before those of later calls. Nothing once
+        closed."""
         if self._worker is None:
             return
         self._queue((entry,))
@@ -175,14 +176,14 @@ class Journal:
         self.release()
 
     def abandon(self) -> None:
-        """As `close`, without waiting for a disk that does not answer."""
+        """Close as `close` does, without waiting for a disk that does not answer."""
         if self._worker is not None:
             self._worker.abandon()
             self._worker = None
         self.release()
 
     def release(self) -> None:
-        """As `close`, for a journal that was not started."""
+        """Close a journal that was not started."""
         if self._file is not None:
             self._file.close()
 

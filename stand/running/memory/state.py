@@ -54,7 +54,7 @@ class Ids(Set[str]):
         return f"Ids({sorted(self)})"
 
     def plus(self, step_id: str) -> Ids:
-        """With this one."""
+        """Return the set with this one added."""
         if step_id in self:
             return self
         parts, last = list(self._parts), frozenset((step_id,))
@@ -65,7 +65,7 @@ class Ids(Set[str]):
         return more
 
     def minus(self, gone: Set[str]) -> Ids:
-        """Without those."""
+        """Return the set without those given."""
         return Ids(step_id for step_id in self if step_id not in gone)
 
 
@@ -115,7 +115,7 @@ class SetUp:
 
     @property
     def text(self) -> str:
-        """As in `chamber at 30 degC, camera on, flap open, linear at 2`."""
+        """The set-up in words, as in `chamber at 30 degC, camera on, flap open, linear at 2`."""
         parts = [f"camera {'on' if self.camera_on else 'off'}", f"flap {'open' if self.flap_open else 'closed'}"]
         parts += [f"{axis} at {position:g}" for axis, position in self.positions.items()]
         parts += [planned.step.words for planned in self.others.values()]
@@ -183,7 +183,7 @@ class RunState:
 
     @property
     def soaked_s(self) -> dict[str, float]:
-        """As earned_ns, in s."""
+        """The soak time so far in s (see earned_ns)."""
         return {step_id: earned_ns / NS_PER_S for step_id, earned_ns in self.soaked_ns.items()}
 
     @property
@@ -209,7 +209,8 @@ class RunState:
 
     @property
     def band_K(self) -> float | None:
-        """Of the last guaranteed soak at the present set-point that was not left out; None when there is none."""
+        """The band of the last guaranteed soak at the present set-point that was not left out; None when there is
+        none."""
         return next((band_K for each, band_K in self._iterate_soaks() if each.step_id not in self.skipped), None)
 
     def _iterate_soaks(self) -> Iterator[tuple[PlannedStep, float]]:
@@ -237,7 +238,7 @@ class RunState:
         return max(0, duration_ns - soaked_ns)
 
     def outage_ns(self, now_ns: int) -> int:
-        """For how long the run stood still since the camera was last seen."""
+        """How long the run stood still since the camera was last seen."""
         return self.out_ns + (0 if self.out_since_ns is None else now_ns - self.out_since_ns)
 
 

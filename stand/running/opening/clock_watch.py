@@ -34,7 +34,7 @@ class ClockWatch:
             await self._clock.sleep_until(self._clock.now_ns() + to_ns(_PERIOD_S))
 
     def look(self) -> None:
-        """Once, now."""
+        """Compare the clocks once, now."""
         now_ns, offset_ns, suspended_ns = (
             self._clock.now_ns(),
             self._clock.utc_offset_ns(),

@@ -108,7 +108,7 @@ class OpenStand:
 
     @property
     def tasks(self) -> tuple[asyncio.Task[None], ...]:
-        """Those whose end ends everything."""
+        """The tasks whose end ends everything."""
         return (*self.background, *self._tasks)
 
     def prepare(self) -> None:

@@ -49,7 +49,7 @@ class Difference:
         return f"{self.path} is {_format_value(self.stand)} as on this stand, {other} the session"
 
     def data(self) -> dict[str, object]:
-        """For the recording."""
+        """The differences as data for the recording."""
         return {"path": self.path, "session": self.session, "stand": self.stand}
 
 

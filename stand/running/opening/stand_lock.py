@@ -40,7 +40,8 @@ _HEATING = ("bus", "regulator")  # of the addresses: two stands that share a cam
 
 
 class LockAddress(NamedTuple):
-    """Of a device: `place` is the same for every way to write the address, and for nothing else on this machine."""
+    """The address of a device: `place` is the same for every way to write the address, and for nothing else on this
+    machine."""
 
     device: str
     place: str

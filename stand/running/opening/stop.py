@@ -83,7 +83,7 @@ class Stop:
         return True
 
     def begin_takedown(self) -> None:
-        """From here on the run makes safe and cleans up by itself and must not be cancelled."""
+        """Mark that from here on the run makes safe and cleans up by itself and must not be cancelled."""
         self._turn(PhaseTurn.TAKE_DOWN)
 
     async def wait_until_aborted(self) -> None:

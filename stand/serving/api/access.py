@@ -467,5 +467,5 @@ def make_last_answer(status: int, body: bytes) -> bytes:
 
 
 def make_last_refusal(status: int, sentence: str) -> bytes:
-    """As `make_last_answer`."""
+    """Make a refusal as `make_last_answer` makes an answer."""
     return make_last_answer(status, make_json({"error": sentence}).encode())

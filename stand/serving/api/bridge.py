@@ -92,7 +92,7 @@ class Bridge:
         self._hub.subscribe(self._follow)
 
     def close(self) -> None:
-        """Nothing is followed any more, and orders are not taken."""
+        """Stop following the stand and taking orders."""
         self._is_open = False
         self._hub.unsubscribe(self._follow)
         if self._next is not None:

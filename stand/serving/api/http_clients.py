@@ -79,7 +79,7 @@ class _Viewer(WebSocketsSansIOProtocol):
 
 
 class Clients:
-    """Of `app`, until closed."""
+    """The clients of `app`, until closed."""
 
     def __init__(self, app: Callable[..., Any]) -> None:
         self._config = Config(
@@ -123,7 +123,7 @@ class Clients:
         return await self._loop.create_server(lambda: self._make_client(door, None), sock=listening)
 
     def look_after(self) -> None:
-        """To be called once a second."""
+        """Drop clients whose time is over; to be called once a second."""
         for client in [each for each in self._server.connections if isinstance(each, _Client)]:
             client.unread = client.unread + 1 if client.transport.get_write_buffer_size() else 0
             if client.unread > _UNREAD:

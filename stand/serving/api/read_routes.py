@@ -191,7 +191,7 @@ def make_read_routes(bridge: Bridge, stream: Stream, access: Access, url: str) -
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
     async def prometheus() -> Response:
-        """For Prometheus, in its text format."""
+        """Return the metrics in Prometheus' text format."""
         text = format_metrics(bridge.snapshot, stream.drops, stream.viewers)
         return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
@@ -232,7 +232,7 @@ def _add_logins(router: APIRouter, access: Access, url: str) -> None:
 
     @router.get("/api/v1/who", response_model=Who)
     async def who(request: Request) -> Response:
-        """As whom the stand knows you, and whether you may only look."""
+        """Return as whom the stand knows you, and whether you may only look."""
         return _make_response(request.state.who.model_dump_json())
 
     @router.post(INVITE_PATH, response_model=Invitation)

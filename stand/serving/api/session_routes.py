@@ -126,7 +126,7 @@ def make_session_routes(_: Bridge, folder: Path) -> APIRouter:
         "/sessions/{name}/report.html", response_class=Response, responses={200: {"content": {"text/html": {}}}}
     )
     async def report(name: SessionName) -> Response:
-        """Its report."""
+        """Return the report of the session."""
         text = await disk.ask(lambda: _read_report(find_session(folder, name)))
         headers = {"content-security-policy": REPORT_CSP}
         return Response(text, headers=headers, media_type="text/html; charset=utf-8")

@@ -43,7 +43,7 @@ class StreamMessage:
     data: str
 
     def json(self) -> str:
-        """As it is sent."""
+        """The item as it is sent."""
         return f'{{"seq":{self.seq},"type":"{self.type}","data":{self.data}}}'
 
     def numbered(self) -> str:
@@ -153,7 +153,7 @@ class Stream:
         return len(self._viewers)
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Run until cancelled."""
         while True:
             self.pump()
             await asyncio.sleep(_BUSY_S if self._viewers else _IDLE_S)
@@ -202,7 +202,7 @@ class Stream:
         return StreamMessage(last, "gone", make_json(gone))
 
     def list_missing_types(self, after: int) -> list[Kind]:
-        """Of which types some are gone for a viewer that has seen all up to `after`."""
+        """List the types of which some are gone for a viewer that has seen all up to `after`."""
         is_other = after > self._seq  # of another stream
         gone: tuple[tuple[Kind, int], ...] = (("event", self._gone_events), ("reading", self._gone_readings))
         return [kind for kind, last in gone if last > after or is_other]

@@ -46,7 +46,8 @@ _PHASES = {"idle": 0, "running": 1, "held": 2, "stopping": 3}
 def make_modules(
     devices: Iterable[DeviceState], readings: Mapping[str, ReadingState], commands: Mapping[str, Ordered]
 ) -> dict[str, Module]:
-    """By name, in the order in which clients show them: the channel's with an underscore for a temperature."""
+    """Make the modules by name, in the order in which clients show them: the channel's with an underscore for a
+    temperature."""
     found: dict[str, Module] = {}
     for name, module in (*_iterate_modules(devices, readings), (RUN, _make_run(commands))):
         while name in found:  # such as an axis that is called chamber

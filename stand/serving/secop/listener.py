@@ -70,7 +70,7 @@ class SecopListener:
         self._ending: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Serve until cancelled."""
         devices = await self._bridge.ask(lambda desk: desk.devices())
         self._listening.setblocking(False)
         node = Node(self._bridge, devices, self._tell, self._failed, read_only=self._read_only)
@@ -179,7 +179,7 @@ class _Client:
         self._connection.close()
 
     async def run(self) -> None:
-        """Until it leaves, or has to."""
+        """Serve the client until it leaves, or has to."""
         tasks = [asyncio.ensure_future(work()) for work in (self._receive, self._answer, self._send)]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

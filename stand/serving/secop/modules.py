@@ -107,7 +107,7 @@ class Parameter:
             return refusal
 
     def describe(self) -> dict[str, object]:
-        """For the node's description."""
+        """Describe the module for the node's description."""
         return {"description": self.text, "datainfo": self.info, "readonly": self.change is None}
 
 
@@ -122,7 +122,7 @@ class ModuleCommand:
     is_stop: bool = False
 
     def describe(self) -> dict[str, object]:
-        """For the node's description."""
+        """Describe the module for the node's description."""
         return {"description": self.text, "datainfo": datainfo.command(self.argument, self.result)}
 
 
@@ -145,7 +145,7 @@ class Module:
         return replace(self, parameters={name: replace(each, change=None) for name, each in self.parameters.items()})
 
     def describe(self) -> dict[str, object]:
-        """For the node's description."""
+        """Describe the module for the node's description."""
         return {
             "description": self.text,
             "interface_classes": [self.interface],

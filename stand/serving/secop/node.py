@@ -66,8 +66,8 @@ class _Reported:
 
 
 class Node:
-    """Of a stand with these devices. `tell` is given each parameter that has changed, with the line that says so;
-    `failed` what should not happen. read_only: nothing is ordered but STOP."""
+    """The SECoP node of a stand with these devices. `tell` is given each parameter that has changed, with the line that
+    says so; `failed` what should not happen. read_only: nothing is ordered but STOP."""
 
     def __init__(
         self,
