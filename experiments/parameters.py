@@ -116,7 +116,7 @@ def _expand_either(value: object, kinds: Mapping[str, type[Settled | Known]]) ->
 
 
 class _UntilSettled(Document):
-    """As a recipe writes thresholds."""
+    """The thresholds as a recipe writes them."""
 
     settled: Settled
 
@@ -127,7 +127,7 @@ Until = Annotated[
 
 
 class _UntilKnown(Document):
-    """As a recipe writes it."""
+    """The condition as a recipe writes it."""
 
     known: Known
 

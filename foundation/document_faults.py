@@ -193,7 +193,7 @@ def _find_booleans(data: object, place: tuple[int | str, ...]) -> Iterator[tuple
 
 
 def _keep_causes(faults: list[ErrorDetails]) -> list[ErrorDetails]:
-    """Without the faults that only follow from another one: a list is too short when its only entry is wrong, and who
+    """Leave out the faults that only follow from another one: a list is too short when its only entry is wrong, and who
     has mistyped one of a choice of words did not mean keys and values."""
     misspelt = {fault["loc"] for fault in faults if fault["type"] == "literal_error"}
     faults = [fault for fault in faults if fault["type"] != "model_type" or fault["loc"] not in misspelt]

@@ -61,11 +61,11 @@ class _Strict(yaml.constructor.SafeConstructor):
 
 
 class _Loader(_Strict, yaml.SafeLoader):
-    """In Python: the one that says what is wrong with a text, and where."""
+    """The loader in Python: the one that says what is wrong with a text, and where."""
 
 
 class _FastLoader(_Strict, QuickLoader):
-    """By libyaml, ten times as fast. It ends the process at ten thousands of levels, hence _MOST_OPENED."""
+    """The loader by libyaml, ten times as fast. It ends the process at ten thousands of levels, hence _MOST_OPENED."""
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)

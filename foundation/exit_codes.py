@@ -41,7 +41,7 @@ def exit_on_error() -> Generator[None]:
 
 
 def _make_exit(error: BaseException, status: int) -> typer.Exit:
-    """With its sentence; with -v where it came from first."""
+    """Make the exit with its sentence; with -v it shows first where the error came from."""
     if get_output().verbose:
         typer.echo("".join(traceback.format_exception(error)), err=True, nl=False)
     return report_failure(error, status)

@@ -35,7 +35,7 @@ def _to_datetime(time_ns: int) -> datetime:
 
 
 def _to_local(time_ns: int) -> datetime:
-    """In the host's zone; UTC where that zone has no such instant."""
+    """Convert to the host's zone; UTC where that zone has no such instant."""
     instant = _to_datetime(time_ns)
     try:
         return instant.astimezone()

@@ -55,7 +55,7 @@ def show(data: object, lines: Iterable[object]) -> None:
 
 
 def json_line(data: object) -> str:
-    """Print a line of what goes on, for programs: as `show` has it, in one line."""
+    """Format what goes on for programs: as `show` prints it, in one line."""
     return json.dumps(make_plain(data), default=str)
 
 

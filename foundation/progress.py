@@ -97,7 +97,8 @@ def _show_bar(title: str, total: float) -> Generator[Report]:
 
 
 class _WallTimeLeft(ProgressColumn):
-    """As the plain lines have it, from the pace of the whole; Rich's own looks back 30 s and is blank in a soak."""
+    """The time left as the plain lines have it, from the pace of the whole; Rich's own looks back 30 s and is blank in
+    a soak."""
 
     def render(self, task: Task) -> Text:
         return Text(_format_time_left(task.elapsed or 0.0, task.percentage / 100.0), style="progress.remaining")

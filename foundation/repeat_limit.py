@@ -26,7 +26,8 @@ _NUMBERS = re.compile(r"[-+]?[0-9][0-9.,:]*")
 
 @dataclass(slots=True)
 class _RepeatCount:
-    """Of one sentence: how many were published since it was last quiet for an hour, when the last, how many since."""
+    """The repeats of one sentence: how many were published since it was last quiet for an hour, when the last, how many
+    since."""
 
     published: int
     published_ns: int
@@ -36,8 +37,8 @@ class _RepeatCount:
 
 @dataclass(slots=True)
 class _StateRepeats:
-    """Of one device, say: when it began in the last hour, as was published; its end, which is withheld; how often it
-    has begun again since."""
+    """The repeats of a state, say of one device: when it began in the last hour, as was published; its end, which is
+    withheld; how often it has begun again since."""
 
     begun_ns: deque[int] = field(default_factory=deque[int])
     end: Event | None = None

@@ -103,7 +103,7 @@ class LatchFile:
 
     @classmethod
     def for_addresses(cls, names: Iterable[str]) -> LatchFile:
-        """Find the files in this computer's folder, by the names of the addresses of what heats and cools."""
+        """The files in this computer's folder, by the names of the addresses of what heats and cools."""
         folder, names = find_state_folder(), tuple(names)
         return cls(folder / f"{name}{end}" for end in _ENDS for name in names)
 

@@ -73,7 +73,7 @@ class Poller:
         self._publish(readings)
 
     def _check_duration(self, took_ns: int) -> None:
-        """Of one read that succeeded."""
+        """Check the duration of one read that succeeded."""
         is_slow = took_ns > to_ns(self.period_s / 2 if self._is_slow else self.period_s)
         if is_slow == self._is_slow:
             return

@@ -118,7 +118,7 @@ class _SafeStateTask:
         return ""
 
     async def _pause(self) -> None:
-        """Until the next try is due, or demanded."""
+        """Wait until the next try is due, or demanded."""
         due_ns = self._clock.now_ns() + to_ns(self._pause_s)
         await wait_for_first(self._clock.sleep_until(due_ns), self._demand.wait())
 

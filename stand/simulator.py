@@ -66,7 +66,8 @@ def describe_laboratory(
 def _make_settings(
     each: Equipment, config: StandConfig, address_of: Callable[[str | None], str | None], *, is_anywhere: bool
 ) -> dict[str, object]:
-    """As the stand's file has them, with the address at which the fake is to answer, and what it needs of the rest."""
+    """Make the settings as the stand's file has them, with the address at which the fake is to answer, and what it
+    needs of the rest."""
     name, kind, settings = each
     if kind.section == "cameras":
         dress = _describe_camera(config.simulation.cameras.get(name, SimulatedCamera())) if config.simulation else {}

@@ -164,7 +164,7 @@ async def _check_in_force(look: DeviceCheck, controller: Controller) -> None:
 
 
 def _classify_error(error: StandError) -> str:
-    """Of a device that was not opened: one that answers is another one, or is set otherwise."""
+    """Classify the error of a device that was not opened: one that answers is another one, or is set otherwise."""
     return "link" if isinstance(error, Unreachable) else "identity"
 
 

@@ -157,7 +157,7 @@ class Absence(NamedTuple):
 
 
 def _list_places(settings: Any) -> Iterable[LockedPlace]:
-    """Its address, if it has one of its own."""
+    """List the device's address, if it has one of its own."""
     address = getattr(settings, "address", None)
     return () if address is None else (LockedPlace("wire", address),)
 

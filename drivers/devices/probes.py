@@ -141,7 +141,7 @@ class Probe:
         return self._client.query(self._language.read, self._parse_reply)
 
     def _identify(self) -> None:
-        """On each new link."""
+        """Identify the probe on each new link."""
         if not self._language.is_named:
             self.identity = Identity(self._language.vendor, self._language.model, "", "", by_map=True)
             return

@@ -212,7 +212,7 @@ def _make(name: str, settings: RelaysSettings, around: DriverContext) -> Relays:
 
 
 async def _check(look: DeviceCheck) -> None:
-    """Its points, and that nothing is on that should not be."""
+    """Check the board's points, and that nothing is on that should not be."""
     if look.settings is None:
         look.opened.add(look.name)
         text = "no relay board: nothing of this stand's own drops the heat"

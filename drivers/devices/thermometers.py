@@ -276,7 +276,7 @@ async def _check(look: DeviceCheck) -> None:
 
 
 def _channels(settings: ThermometerModuleSettings, of_section: OfSection, map_of: MapOf) -> Iterator[Channel]:
-    """Of each sensor its temperature, and the module's word for it."""
+    """The temperature of each sensor, and the module's word for it."""
     for name in list_by_channel(of_section("thermometers")):
         yield Channel(name, "degC", "temperature")
         yield Channel(f"{name}_raw", "1", "count")

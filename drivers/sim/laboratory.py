@@ -306,8 +306,8 @@ class Laboratory:
         self.addresses[name] = address
 
     def _build(self) -> None:
-        """In the order of their ranks: what acts on the plant, in the order in which it acts; what shares the bus; what
-        has a line of its own."""
+        """Build the devices in the order of their ranks: what acts on the plant, in the order in which it acts; what
+        shares the bus; what has a line of its own."""
         ranked = {name: fake_of(each.fake) for name, each in self.spec.devices.items()}
         self._build_those(ranked, CONTROL, OUTPUT)
         self.plant.on_step.append(self._conduct)  # after the regulator's and the relays'
@@ -377,7 +377,7 @@ class Laboratory:
         return at(settings.address) if settings.address else _bind_free_address(at)
 
     def _share_a_switch(self) -> None:
-        """Between several cameras and the computer; in virtual time they take turns, and need none."""
+        """Put a switch between several cameras and the computer; in virtual time they take turns, and need none."""
         if not self.is_virtual and len(self.cameras) > 1:
             self.switch = Switch(_LINE_MBps)
             for camera in self.cameras.values():

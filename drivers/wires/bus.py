@@ -189,7 +189,8 @@ class Bus:
         return ERRORS[fault.fault](device, f"{where}{fault}")
 
     def _transact(self, function: Callable[..., Result], *args: object) -> Result:
-        """In the lane: wait until the line is free and clean, run one transaction, set when it is free again."""
+        """In the worker thread, wait until the line is free and clean, run one transaction, set when it is free
+        again."""
         self._settle()
         hang_ups = self._client.hang_ups
         try:

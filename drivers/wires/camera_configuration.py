@@ -126,8 +126,8 @@ def _list_offered(device: GigeDevice, feature: str) -> tuple[str, ...]:
 
 
 def _set_heartbeat(name: str, device: GigeDevice, heartbeat_s: float) -> float:
-    """Through the bootstrap register: not every camera names it as a feature. Refused when it would free itself between
-    two of Aravis' requests."""
+    """Set the heartbeat through the bootstrap register: not every camera names it as a feature. Refused when it would
+    free itself between two of Aravis' requests."""
     device.write_register(HEARTBEAT_TIMEOUT_MS, round(heartbeat_s * 1000))
     taken_s = device.read_register(HEARTBEAT_TIMEOUT_MS) / 1000
     if taken_s < LEAST_HEARTBEAT_S:

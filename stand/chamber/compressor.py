@@ -181,5 +181,5 @@ class CompressorFile:
 
 
 def _call_directly(function: Callable[..., object], *arguments: object) -> object:
-    """In this process."""
+    """Call the function in this process."""
     return function(*arguments)

@@ -204,7 +204,7 @@ def _show_plan(server: Server) -> None:
 
 
 def _get_step_number(planned: Answer) -> int:
-    """Of a step of the plan, as `stand status` counts: 1 is the first."""
+    """The number of a step of the plan, as `stand status` counts: 1 is the first."""
     return cast("int", planned["index"]) + 1
 
 

@@ -118,7 +118,8 @@ def _get_address(port: SerialPort | None) -> str:
 
 
 def _parse_bus(text: str) -> str:
-    """As the stand's file has it: a device file is a serial port, anything else a gateway, whose usual port is 502."""
+    """Parse a bus as the stand's file has it: a device file is a serial port, anything else a gateway, whose usual port
+    is 502."""
     text = text.strip()
     if not text or text.startswith(("serial:", "tcp:")):
         return text
@@ -142,7 +143,7 @@ def _parse_axis(text: str) -> ConnectedAxis:
 
 
 def _identify_camera(connected: Connected) -> Connected:
-    """With the serial number of the camera that answers; ConfigError when the address cannot be asked."""
+    """Add the serial number of the camera that answers; ConfigError when the address cannot be asked."""
     if not connected.camera:
         return connected
     try:

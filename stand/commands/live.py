@@ -47,7 +47,7 @@ class BackgroundOutput:
 
     def __init__(self) -> None:
         self._waiting: queue.Queue[Callable[[], object] | None] = queue.Queue(_MOST_WAITING)
-        self._thread = threading.Thread(target=self._show, name="aside", daemon=True)
+        self._thread = threading.Thread(target=self._show, name="output", daemon=True)
         self._thread.start()
 
     def __call__(self, show: Callable[CallArgs, object]) -> Callable[CallArgs, None]:

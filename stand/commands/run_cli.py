@@ -189,7 +189,7 @@ def _follow(server: Server, submitted: QueuedRun, *, detach: bool, report: bool)
 
 
 def _resume_remotely(server: Server, directory: Path, *, attended: bool, report: bool) -> None:
-    """By the daemon that has the stand."""
+    """Resume the run in the daemon that has the stand."""
     if attended:
         raise ConfigError("--attended: `stand serve` has this stand, and resumes a run as it was queued; leave it out")
     session = follow(server, submit_resume(server, directory))

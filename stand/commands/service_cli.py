@@ -153,7 +153,7 @@ d {SYSTEM_FOLDER} 2770 root {group} -
 
 
 def _quote(argument: str) -> str:
-    """As systemd reads a command line."""
+    """Quote a command line as systemd reads it."""
     return f'"{_escape_unit(argument)}"' if re.search(r"[\s\"'\\]", argument) else _escape_unit(argument)
 
 

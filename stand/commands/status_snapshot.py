@@ -52,7 +52,8 @@ class RemoteStand:
         self.session = state.run.session if state.run is not None else self.session
 
     def _fetch_drift_px(self) -> float | None:
-        """Of the last frame that the daemon looked at; None for a run of its own, which looks at none."""
+        """Fetch the drift of the last frame that the daemon looked at; None for a run of its own, which looks at
+        none."""
         with suppress(SessionError):
             found = self.server.request("GET", f"{API}/frame")
             drift_px = cast("EventData", found).get("mean_px") if isinstance(found, dict) else None

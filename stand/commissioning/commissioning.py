@@ -122,7 +122,7 @@ async def _make_safe(assembly: Assembly, stop: Stop, found: list[Finding], tell:
 
 
 def _collect_identities(assembly: Assembly) -> dict[str, Identity]:
-    """Of those that have answered."""
+    """Collect the identities of the devices that have answered."""
     known: dict[str, Identity] = {}
     for name, device in assembly.devices.every.items():
         with suppress(Unreachable):  # a camera that is not open

@@ -58,7 +58,8 @@ async def rehearse(file: Path, stand: StandConfig | None = None) -> Rehearsal:
 
 
 def _get_settings(stand: StandConfig | None) -> GigeSettings:
-    """Of the stand's first GigE camera, whatever its serial number; when there is none, such as each camera can."""
+    """Get the settings of the stand's first GigE camera, whatever its serial number; when there is none, such as each
+    camera can."""
     cameras = () if stand is None else stand.cameras.values()
     first = next((each for each in cameras if isinstance(each, GigeSettings)), _ANY)
     return first.model_copy(update={"serial_number": None})

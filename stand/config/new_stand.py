@@ -94,7 +94,7 @@ def _read_installed(folder: Folder, name: str) -> str:
 
 
 def _escape_replacement(text: str) -> str:
-    """In what a pattern is replaced by."""
+    """Escape the text that a pattern is replaced by."""
     return text.replace("\\", r"\\")
 
 

@@ -187,8 +187,8 @@ def _extract_ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC:
 
 
 def _find_arrival_s(pv: NDArray[np.float64], to_degC: float, level_K: float) -> float:
-    """From when on every value is within `level_K`, NaN when the last one is not: between two polls, and between the
-    display's change to that digit and its next."""
+    """Find from when on every value is within `level_K`, NaN when the last one is not: between two polls, and between
+    the display's change to that digit and its next."""
     times_s = [_find_last_outside_s(pv, to_degC, level_K + side_K) for side_K in (_HALF_DIGIT_K, -_HALF_DIGIT_K)]
     return sum(times_s) / 2.0
 
@@ -220,7 +220,7 @@ def _drop_bad(column: tuple[NDArray[np.int64], NDArray[np.float64]]) -> NDArray[
 
 
 def _slice(column: NDArray[np.float64], mark: StepMark, end_s: float) -> NDArray[np.float64]:
-    """From the mark to `end_s`, times counted from the mark."""
+    """Slice from the mark to `end_s`, times counted from the mark."""
     begin_s = mark.time_ns / NS_PER_S
     first, last = np.searchsorted(column[0], (begin_s, end_s))
     return column[:, first:last] - np.array([[begin_s], [0.0]])

@@ -73,13 +73,13 @@ class ConfiguredStand(KnownStand):
         return ""
 
     def camera_fault(self) -> str:
-        """The fault of a stand without a camera."""
+        """Why no frames can be taken; "" when there is a camera."""
         if self._config.cameras:
             return ""
         return "needs a camera, and this stand has none; name it under cameras in the stand's file"
 
     def supply_fault(self) -> str:
-        """The fault of a stand without relays."""
+        """Why cameras cannot be switched off; "" when relays can do it."""
         if self._config.relays is not None:
             return ""
         return "no relay switches the cameras, which stay on: this stand has no relay board; leave it out"

@@ -150,20 +150,20 @@ def estimate_return_s(plan: Iterable[PlannedStep], config: StandConfig, learned:
 
 
 def _estimate_in_band_s(step: Step, approach: _Approach, chamber: ChamberModel) -> float | None:
-    """Of a soak: s until the chamber is in its band; None when it is, and of other steps."""
+    """Estimate, for a soak, how long, s, until the chamber is in its band; None when it is, and of other steps."""
     after_s = chamber.arrival_s(approach.from_degC, approach.to_degC) - approach.age_s
     return after_s if isinstance(step, AnySoak) and after_s > 0.0 else None
 
 
 def _count_frames(step: Step, duration_s: float, in_band_after_s: float | None) -> int:
-    """Of a soak: its looks, from when the chamber is in its band."""
+    """Count the looks of a soak, from when the chamber is in its band."""
     if not isinstance(step, SoakUntilSettled):
         return step.frame_count
     return max(0, math.ceil((duration_s - (in_band_after_s or 0.0)) / step.look_every_s))
 
 
 def _explain_dark_capture(step: Step, found: Situation) -> str:
-    """Of a capture of the target through a flap that no step has opened."""
+    """Explain what is wrong with a capture of the target through a flap that no step has opened."""
     if not isinstance(step, Capture) or found.flap_open:
         return ""
     return "the flap is closed, so these frames are dark; put open_flap before them, and close_flap after"
@@ -192,7 +192,8 @@ def _find_warning(step: Step, approach: _Approach, chamber: ChamberModel, expect
 
 
 def _explain_extension(soak: Soak, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
-    """Until when a soak goes on beyond its time, or that it ends with the chamber outside its band; "" otherwise."""
+    """Explain until when a soak goes on beyond its time, or that it ends with the chamber outside its band; ""
+    otherwise."""
     if expected_s <= soak.duration_s:
         return ""
     arrives_s = chamber.arrival_s(approach.from_degC, approach.to_degC, soak.band_K) - approach.age_s

@@ -211,7 +211,8 @@ class Guard:
         self.hub.publish(GUARD_LATE.at(now_ns, gap_s=gap_s, from_ns=looked_ns, to_ns=now_ns))
 
     def _check_rules(self) -> list[Fault]:
-        """Those that trip; those that only warn are published when they begin. Every rule is asked: some remember."""
+        """Return the rules that trip; those that only warn are published when they begin. Every rule is asked: some
+        remember."""
         now_ns = self.clock.now_ns()
         faults: list[Fault] = []
         self._is_excusing = False

@@ -86,7 +86,7 @@ class Scatter:
         self._values: deque[float] = deque(maxlen=14)
 
     def most_K(self, readings: Readings) -> float:
-        """The largest difference after one more look."""
+        """Take one more look; return twice the largest second difference of the last readings, K."""
         reading = readings.known(self._channel)
         if reading is not None and reading is not self._seen and not math.isnan(reading.value):
             self._seen = reading

@@ -186,7 +186,7 @@ def _has_probe(config: StandConfig) -> bool:
 
 
 def _watch_sensors(config: StandConfig, seen: SensorHistory) -> tuple[Watch, ...]:
-    """Of two sensors that disagree each may be wrong: the others say which."""
+    """Compare two sensors. Of two that disagree each may be wrong: the others show which."""
     limits = config.guard.sensors
 
     def apart(channel: str, most_K: float) -> Rule:

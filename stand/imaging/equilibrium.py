@@ -132,7 +132,7 @@ class CameraEquilibrium:
                     self._keep(to_seconds(reading.time_ns), reading.value)
 
     def _keep(self, time_s: float, camera_degC: float) -> None:
-        """As long as a rate is judged by it."""
+        """Keep a value as long as a rate is judged by it."""
         self._readings.append((time_s, camera_degC))
         while self._readings[0][0] < time_s - self._limits.duration_s:
             self._readings.popleft()

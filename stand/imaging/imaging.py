@@ -120,7 +120,7 @@ class Imaging:
         return frames
 
     def _publish(self, frames: Iterable[Frame], step_id: str, flags: tuple[str, ...] = ()) -> dict[str, Frame]:
-        """By channel."""
+        """Publish the values by channel."""
         self._without_camera_ns = 0
         published: dict[str, Frame] = {}
         for frame in frames:

@@ -290,7 +290,7 @@ class Run:
         """The published state of the run, from before its first step on."""
         assembly, recorder, state, before = self._assembly, self.recorder, self.log.state, self.job.before
         kept = state if before is None else before.kept
-        lane = WorkerThread("night", assembly.clock, patient=False)  # nothing moves yet: the disk may take its time
+        lane = WorkerThread("estimate", assembly.clock, patient=False)  # nothing moves yet: the disk may take its time
         leaving.callback(lane.close)
         estimate = await lane.call(estimate_plan, state.plan, self.job.order.config, recorder.directory.parent)
         gate, clock, open_stand = assembly.stand.gate, assembly.clock, self._open_stand

@@ -140,7 +140,8 @@ class IdleLog:
         self._cut_off.append(recording)
 
     async def _remove_old(self) -> None:
-        """Those older than the stand's file allows, reported; what the disk refuses is tried again tomorrow."""
+        """Remove the records older than the stand's file allows, reported; what the disk refuses is tried again
+        tomorrow."""
         days = self._assembly.config.recording.idle_log_days
         removed = await self._removing.call(remove_idle_logs, self._out, self._get_today(), days) if days else []
         if removed:
@@ -196,7 +197,7 @@ def remove_idle_logs(directory: Path, today: str, days: int) -> list[str]:
 
 
 def _compute_age_days(day: str, today: str) -> int:
-    """Of a day, both as YYYYMMDD; 0 for what is no date."""
+    """The age of a day, both as YYYYMMDD; 0 for what is no date."""
     try:
         return (datetime.strptime(today, "%Y%m%d") - datetime.strptime(day, "%Y%m%d")).days
     except ValueError:

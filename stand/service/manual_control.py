@@ -127,7 +127,7 @@ class ManualControl:
 
 
 def _make_verb(verb: Verb, takes: Iterable[kinds.VerbNumber]) -> DeviceVerb:
-    """As it is published."""
+    """Make the verb as it is published."""
     arguments = (Argument(name=name, unit=unit, minimum=low, maximum=high) for name, unit, low, high, _ in takes)
     return DeviceVerb(verb=verb.name, text=verb.text, arguments=tuple(arguments))
 

@@ -169,7 +169,7 @@ def start_working(directory: Path) -> ExitStack:
 
 
 def _prune(queue: Queue) -> Queue:
-    """Without all but the latest of the runs that have ended."""
+    """Drop all but the latest of the runs that have ended."""
     ended = [entry.id for entry in queue.entries if not entry.is_open and entry.state is not QueueState.RUNNING]
     old = frozenset(ended[:-KEPT_ENDED])
     return queue.model_copy(update={"entries": tuple(entry for entry in queue.entries if entry.id not in old)})

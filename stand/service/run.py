@@ -453,7 +453,7 @@ async def _record_and_run(
     *,
     answer: Callable[[], Work] | None = None,
 ) -> Recorder:
-    """From the camera's start to the end of the recording."""
+    """Record and run, from the camera's start to the end of the recording."""
     is_camera_on = job.before is None or job.before.kept.set_up.camera_on
     async with AsyncExitStack() as stack:
         publish_identities(open_stand.assembly, open_stand.assembly.hub.publish)

@@ -66,7 +66,7 @@ class ReportQueue:
         self._works: set[asyncio.Task[None]] = set()
 
     def add(self, session: Path) -> None:
-        """Its report, in the session's folder, when its turn has come; event `reported`."""
+        """Make the session's report, in its folder, when its turn has come; event `reported`."""
         work = asyncio.create_task(self._make_report(session))
         self._works.add(work)
         work.add_done_callback(self._works.discard)

@@ -340,7 +340,7 @@ class StandService(Served):
 
     @property
     def _run(self) -> RunControl | None:
-        """Of the run that has the stand, once it can be asked anything."""
+        """The control of the run that has the stand, once it can be asked anything."""
         guest = self.host.guest
         return None if guest is None else guest.course
 

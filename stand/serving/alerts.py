@@ -100,7 +100,7 @@ class AlertTracker:
         return self._limit(found, now_ns)
 
     def _limit(self, found: Iterable[tuple[AlertCause, str, str]], now_ns: int) -> list[AlertMessage]:
-        """Those that are wanted, and within what an hour may have."""
+        """Select the alerts that are wanted, within what an hour may have."""
         messages: list[AlertMessage] = []
         while self._sent_ns and now_ns - self._sent_ns[0] >= _HOUR_NS:
             self._sent_ns.popleft()

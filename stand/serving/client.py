@@ -208,7 +208,7 @@ def list_running_sessions(root: Path | None = None) -> list[Path]:
 
 
 def _select_daemons(session: Path, daemons: list[LiveDaemon]) -> list[LiveDaemon]:
-    """Those that run `session`, by its name, else by the folder that has this name now."""
+    """Select the daemons that run `session`, by its name, else by the folder that has this name now."""
     paths = _list_spellings(session)
     named = [daemon for daemon in daemons if not paths.isdisjoint(_list_paths(daemon))]
     if len(named) == 1 or not daemons:

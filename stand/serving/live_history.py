@@ -254,7 +254,7 @@ class History:
                 return
 
     def reference(self, camera: str, time_ns: int) -> None:
-        """Count, from then on, the drift of this camera counts from another frame."""
+        """From then on, count the drift of this camera from another frame."""
         self._references.append(Mark(time_ns, "reference", camera, ""))
 
     def columns(self, from_ns: int, to_ns: int, points: int = 1200, channels: Collection[str] | None = None) -> Columns:

@@ -67,7 +67,7 @@ class PageData:
         hub.subscribe(self._follow)
 
     def _follow(self, item: Item) -> None:
-        """On the control loop: a few assignments."""
+        """Follow the hub on the control loop, in a few assignments."""
         if isinstance(item, Frame):
             camera = item.channel.partition(".")[0]
             if camera in self._newest:
@@ -93,7 +93,7 @@ class PageData:
     # From here on: in the thread that serves clients.
 
     async def run(self, session: Callable[[], str]) -> None:
-        """Until cancelled, keep the history, look at frames. session: the folder of the run under way, "" for none."""
+        """Keep the history and look at frames until cancelled. session: folder of the run under way, "" for none."""
         self._session = session
         try:
             async with asyncio.TaskGroup() as tasks:

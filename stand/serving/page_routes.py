@@ -213,7 +213,7 @@ def _get_change_key(session: Path) -> tuple[Path, int]:
 
 
 def _get_preview(viewing: PageData, camera: str) -> Preview | None:
-    """Of that camera, None when nothing was looked at yet; Missing when there is no such camera."""
+    """Get the preview of that camera, None when nothing was looked at yet; Missing when there is no such camera."""
     if camera and camera not in viewing.previews and viewing.previews:
         raise Missing("no frame of a camera of that name was looked at")
     return viewing.previews.get(camera) if camera else next(iter(viewing.previews.values()), None)

@@ -116,7 +116,7 @@ class Previewer:
         )
 
     def _drift(self, shot: FrameShot, found: Detection) -> Float:
-        """Of each marker, px; NaN where it is unknown."""
+        """The drift of each marker, px; NaN where it is unknown."""
         if shot.role not in DRIFT_ROLES:
             return np.full_like(found.centres_px, np.nan)
         if shot.as_reference or shot.camera not in self._reference:

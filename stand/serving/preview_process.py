@@ -60,5 +60,5 @@ def load_recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]
 
 
 def prepare() -> None:
-    """Prepare a process of its own."""
+    """Prepare the process that makes previews."""
     lower_priority()

@@ -179,7 +179,7 @@ class AravisCamera:
         raise self._lose(f"{ATTEMPTS} frame periods brought no complete frame")
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
-        """In the lane; what Aravis reports leaves as a DeviceError."""
+        """Call in the worker thread; what Aravis reports leaves as a DeviceError."""
         if self._lane is None:
             raise Unreachable(self._name, "not open")
         try:

@@ -111,7 +111,7 @@ def check_packets(name: str, address: str, packet_size: int) -> Finding:
 
 
 async def _check(look: DeviceCheck) -> None:
-    """Its settings, its temperature and its line; one without supply is left alone."""
+    """Check its settings, its temperature and its line; one without supply is left alone."""
     await _check_powered(look)
     for finding in check_line(look.of_section("cameras"), look.name):
         look.add(finding)
@@ -156,7 +156,7 @@ async def check_settings(camera: Camera, add: Add) -> None:
 
 
 async def _is_supplied(look: DeviceCheck) -> bool:
-    """As far as the relays tell."""
+    """Whether the camera is powered, as far as the relays show."""
     if "relays" not in look.opened:
         return True
     try:

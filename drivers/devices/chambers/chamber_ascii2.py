@@ -87,7 +87,7 @@ class Ascii2Language(ChamberLanguage):
         self._way_degC: tuple[float, float] | None = None  # of the last set-point: from where, to where
 
     def state(self) -> ChamberState:
-        """Parse the state from the reply to I."""
+        """Read the state by I."""
         values, digits = self._read()
         nominal = 0 if self._settings.order == "nominal_actual" else 1
         return ChamberState(
@@ -114,7 +114,8 @@ class Ascii2Language(ChamberLanguage):
         return self.client.query(self._bytes("I"), self._answer)
 
     def _answer(self, heard: bytes) -> tuple[list[float], str] | None:
-        """As parse; a unit always sends as many fields and digits: a reply that lost some bytes gives itself away."""
+        """Parse the answer; a unit always sends as many fields and digits: a reply that lost some bytes gives itself
+        away."""
         if (found := parse(heard)) is None:
             return None
         if len(found[0]) <= max(*self._settings.write_fields, 1):

@@ -91,7 +91,7 @@ class CtsLanguage(ChamberLanguage):
             self.not_reported = f"{', '.join(unasked)} (not asked); {self.not_reported}"
 
     def state(self) -> ChamberState:
-        """Parse the state from the replies to A0, S, and F when there is an error."""
+        """Read the state by A0, S, and F when there is an error."""
         actual, nominal = self.client.query(*self._asked("A0", 14, self._temperatures))
         flags, code = self.client.query(*self._asked("S", 10, self._flags))
         alarms = (self._error_text(code),) if flags[1] == "1" or ord(code) & 0x7F not in _NO_ERROR else ()
@@ -113,7 +113,7 @@ class CtsLanguage(ChamberLanguage):
         self.client.send(*self._asked(f"a0 {degC:05.1f}", 1, _expecting("a")))
 
     def humidity_off(self) -> None:
-        """Switch humidity control off; its channel differs from unit to unit."""
+        """Refuse: the channel of humidity control differs from unit to unit, so the panel must switch it off."""
         raise Refused(self._name, "humidity is on, and can only be switched off at the panel: do so, and start again")
 
     def run(self, on: bool) -> None:
@@ -169,7 +169,8 @@ def _parse_ramps(text: str) -> bool | None:
 
 
 def _parse_door(text: str) -> bool | None:
-    """Of O, start, error, unused, flags: bit 2 is set while the door is closed (example of the manual)."""
+    """Parse the reply to O, start, error, unused, flags: bit 2 is set while the door is closed (example of the
+    manual)."""
     return not ord(text[4]) & _DOOR_CLOSED if text[:1] == "O" else None
 
 

@@ -66,12 +66,12 @@ class EspecLanguage(ChamberLanguage):
         return self._ask("TYPE?")
 
     def limits_degC(self) -> tuple[float, float] | None:
-        """Parse the limits from the reply to TEMP?."""
+        """Read the limits by TEMP?."""
         _, _, high_degC, low_degC = self._temperatures()
         return low_degC, high_degC
 
     def state(self) -> ChamberState:
-        """Parse the state from the replies to TEMP?, MON?, HUMI? and ALARM?."""
+        """Read the state by TEMP?, MON?, HUMI? and ALARM?."""
         actual_degC, set_degC, _, _ = self._temperatures()
         _, humidity, mode, alarms = self.client.query(self._bytes("MON?"), self._monitor)
         word = (mode.split() or [""])[0]

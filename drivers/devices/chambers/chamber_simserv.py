@@ -88,7 +88,7 @@ class SimservLanguage(ChamberLanguage):
         return f"{self._text(99997, _TYPE)}, serial number {self._text(99997, _SERIAL_NUMBER)}"
 
     def limits_degC(self) -> tuple[float, float] | None:
-        """Parse the limits from the replies to 11007 and 11009."""
+        """Read the limits by 11007 and 11009."""
         low_degC, high_degC = sorted((self._number(11007, _TEMPERATURE), self._number(11009, _TEMPERATURE)))
         return low_degC, high_degC
 
@@ -120,7 +120,7 @@ class SimservLanguage(ChamberLanguage):
         self._tell(14001, self._settings.start_channel, int(on))
 
     def _gradients(self) -> tuple[str, ...]:
-        """Those that are set; a unit that has none refuses the question."""
+        """Read the gradients that are set; a unit that has none refuses the question."""
         if self._settings.allows_gradient:
             return ()
         found: list[str] = []

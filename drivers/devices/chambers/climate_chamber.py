@@ -173,7 +173,7 @@ class ClimateChamber:
             )
 
     def _identify_and_read(self) -> ChamberState:
-        """Its state, after it was made sure who answers."""
+        """Read the state, after making sure which unit answers."""
         if not (self._exclusive.is_known and self._language.client.connected):
             self._check()
         return self._language.state()

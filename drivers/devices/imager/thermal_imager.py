@@ -398,7 +398,7 @@ def _describe_picture(settings: ThermalImagerSettings, file: Path, image: Radiom
 
 
 async def _check(look: DeviceCheck) -> None:
-    """Not opened: what its folder has, and what the newest picture shows."""
+    """Check, without opening it, what its folder has, and what the newest picture shows."""
     look.add(await asyncio.to_thread(check_folder, look.settings))
 
 

@@ -304,7 +304,8 @@ class Flap:
         return Identity("Pololu", model, self._settings.serial_number, version)
 
     def _check_settings(self, device: _UsbDevice) -> None:
-        """Those in force, that is in RAM; they are read before every target, because a restart may change them."""
+        """Check the settings in force, that is in RAM; they are read before every target, because a restart may change
+        them."""
         (mode,) = self._read(device, _GET_RAM_SETTINGS, 0, _INPUT_MODE_OFFSET, 1)
         if mode != _INPUT_MODE_SERIAL:
             raise Refused(self.name, f"the Jrk's input mode is {mode}, it must be 0 (serial) to obey targets")
@@ -455,7 +456,7 @@ def _advise(error: DeviceError, name: str, settings: FlapSettings) -> str:
 
 
 async def _check(look: DeviceCheck) -> None:
-    """Its controller, and where it stands."""
+    """Check the flap's controller, and where it stands."""
     if look.settings is None:
         look.found("link", "ok", "no flap: cameras see the target all the time")
     else:

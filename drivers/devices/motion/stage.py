@@ -350,7 +350,8 @@ class Axis:
                 self._connect_identified().command(letters, payload)
 
     def _begin_homing(self, turn: MotionCommand) -> None:
-        """From here on the scale means nothing until its zero is set, even if the controller reports one."""
+        """Begin homing. From here on the scale means nothing until its zero is set, even if the controller reports
+        one."""
         self._connect_identified()
         turn.check()
         self._zero_due = True

@@ -265,7 +265,7 @@ class HeatModule:
         raise DeviceFault(self.name, text)
 
     async def _check_dead_man(self) -> None:
-        """Now and then: would it still end the heat when this program dies, as when it was armed?"""
+        """Check now and then: would the module still end the heat when this program dies, as when it was armed?"""
         if self._clock.now_ns() - self._checked_ns < to_ns(_CHECKED_EVERY_S):
             return
         settings, found = self._settings, await self._unit.snapshot([_WATCHDOG, _TIME, self._safe])

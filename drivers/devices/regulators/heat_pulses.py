@@ -108,7 +108,7 @@ class HeatPulses:
         self._until_ns, self._is_compared, self.uncontrolled = 0, True, ""
 
     async def _switch_off(self) -> None:
-        """With a second try for a relay that reads on; DeviceFault when it stays so."""
+        """Switch off, with a second try for a relay that reads on; DeviceFault when it stays so."""
         try:
             await self._board.switch(HEAT, on=False)
         except Refused:
@@ -118,7 +118,8 @@ class HeatPulses:
                 raise DeviceFault(f"{self._board.name}.{HEAT}", f"stays on: {error.text}") from error
 
     async def _compare(self, now_ns: int) -> None:
-        """Not within the tolerance of the instant at which it drops, and not while its last command is unconfirmed."""
+        """Compare the relay with its command, but not within the tolerance of the instant at which it drops, and not
+        while its last command is unconfirmed."""
         left_s = (self._until_ns - now_ns) / NS_PER_S
         if not self._is_compared or (self._until_ns and abs(left_s) < _TOLERANCE_S):
             return

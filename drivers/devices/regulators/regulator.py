@@ -146,7 +146,8 @@ class Regulator:
         raise DeviceFault(self.name, f"its set-point is not in force: {'; '.join(objections)}")
 
     def _objections(self, snapshot: Snapshot, *, are_followed: bool = True) -> tuple[str, ...]:
-        """Of a poll. What is refreshed falls back before the first set-point, and is followed from that on."""
+        """List the objections to a poll. What is refreshed falls back before the first set-point, and is followed from
+        that on."""
         running = is_confirmed(self._map.commands["run"], snapshot)
         asked = [check for check in self._map.in_force if running or not check.while_running]
         return tuple(
@@ -188,7 +189,8 @@ class Regulator:
         self.start_ups += 1
 
     async def _write_set_point(self, degC: float) -> float:
-        """As the unit took it. One that every write wears is not given the value it has."""
+        """Write the set-point and return it as the unit took it. A unit that every write wears is not given the value
+        it has."""
         wears = self._map.points["sp"].eeprom and not self._map.startup
         if wears and (await self._unit.snapshot(["sp"])).samples["sp"].value == degC:
             return degC

@@ -187,7 +187,7 @@ class SoftwareRegulator:
         return law
 
     async def _wait_for_rest(self) -> None:
-        """Until the set-point has been held for a while."""
+        """Wait until the set-point has been held for a while."""
         since_ns = self._clock.now_ns()
         while self._rests_ns is None or self._clock.now_ns() - self._rests_ns < to_ns(_REST_S):
             self._check_controls()
@@ -307,7 +307,7 @@ async def _autotune(stand: ManualActions, name: str, given: Arguments) -> None:
 
 
 async def _check(look: DeviceCheck) -> None:
-    """Nothing is opened: what it measures and heats by is looked at by itself."""
+    """Open nothing: what it measures and heats by is checked as a device of its own."""
     look.opened.add(look.name)
     by = "heat_module" if "heat_module" in look.made else f"relays.{HEAT}"
     text = f"this program itself: it measures thermometers.{look.settings.thermometer} and heats by {by}"

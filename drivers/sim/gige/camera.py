@@ -142,7 +142,7 @@ class Schedule:
         return round(self._registers.real("ExposureTime") * 1000)
 
     def _period_ns(self) -> int:
-        """Of the free run: as asked for, but never shorter than the exposure."""
+        """The period of the free run: as asked for, but never shorter than the exposure."""
         enabled = self._registers.integer("AcquisitionFrameRateEnable")
         rate_Hz = self._registers.real("AcquisitionFrameRate") if enabled else MAX_RATE_Hz
         return max(round(NS_PER_S / rate_Hz), self._exposure_ns())

@@ -89,7 +89,7 @@ class _ArchiveResult:
 
 
 def _print_line(text: str) -> None:
-    """For people, as it happens."""
+    """Print a line for people, as it happens."""
     if not get_output().as_json:
         typer.echo(escape_line(text))
 
@@ -97,8 +97,8 @@ def _print_line(text: str) -> None:
 def _select_to_copy(
     entries: Sequence[ListedSession], out: Path, found: _ArchiveResult, *, again: bool
 ) -> list[ListedSession]:
-    """Those without a copy in `out`. Those that must wait are listed, and those whose copy is gone: a disk that is not
-    mounted must not fill the one that its place is on."""
+    """Select the sessions without a copy in `out`. Those that must wait are listed, and those whose copy is gone: a
+    disk that is not mounted must not fill the one that its place is on."""
     due: list[ListedSession] = []
     for entry in entries:
         copy = (out / entry.name).resolve()

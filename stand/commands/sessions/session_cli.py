@@ -267,7 +267,7 @@ def trim_session(
 
 
 def _parse_range(begin: str, end: str | None, session: Session, seen: Scan) -> tuple[int, int]:
-    """From when up to when; ConfigError when that is not a time, or none."""
+    """Parse from when up to when; ConfigError when that is not a time, or none."""
     begin_ns = _parse_instant(begin, session, seen)
     if seen.end_ns is not None and begin_ns > seen.end_ns:
         raise ConfigError(f"--from {begin} is after the session's end ({session.utc.local_text(seen.end_ns)})")

@@ -41,7 +41,7 @@ def format_info(found: Overview) -> Iterator[str]:
 
 
 def _make_entry(found: Overview) -> ListedSession:
-    """As the list has it, with the steps of the system clock in between."""
+    """Make the entry as the list has it, with the steps of the system clock in between."""
     seen, utc = found.scanned, found.scanned.utc
     start_ns = None if seen.begin_ns is None else utc.utc_ns(seen.begin_ns)
     end_ns = None if seen.end_ns is None else utc.utc_ns(seen.end_ns)

@@ -80,7 +80,7 @@ class Decider:
             helper.close()
 
     def _call_process(self, helper: WorkerProcess, decide: Decide) -> Mapping[str, Any]:
-        """In the lane."""
+        """Call the process, in the worker thread."""
         return helper.line(_LINE).run(self._decides, str(self._directory), decide.parameters)
 
 

@@ -320,7 +320,7 @@ class Executor:
         await (self._run_unless_skipped(planned.step_id, work) if step.ends_when_skipped else work)
 
     async def _decide(self, planned: PlannedStep, step: Decide) -> None:
-        """Not again after a kill between the decision and the end of the step."""
+        """Decide, but not again after a kill between the decision and the end of the step."""
         if self._state.is_decided(planned.step_id):
             return
         decided = await self._decider(step)

@@ -127,7 +127,7 @@ class SettlingWatch:
         return bool(self._looks)
 
     def _measure_movement(self, frame: Frame) -> None:
-        """In the lane: the markers, and how far they have moved since the look before."""
+        """Measure, in the worker thread, the markers, and how far they have moved since the look before."""
         from thermostand.markers.detection import DetectionError, detect  # see preload_for
 
         try:

@@ -88,7 +88,7 @@ class SoakRunner:
         return self._log.state
 
     def _is_interrupted(self) -> bool:
-        """From earning anything."""
+        """Whether the soak time stands still."""
         return bool(self._gate.reasons) or self._state.is_setup_invalid
 
     def _compute_judgement_ns(self, step: AnySoak, soaked_ns: int) -> int:

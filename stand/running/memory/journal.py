@@ -188,7 +188,7 @@ class Journal:
             self._file.close()
 
     def _commit(self) -> OSError | None:
-        """In the lane's thread: what waits on the disk; on OSError the file is as it was."""
+        """In the worker thread, put what waits on the disk; on OSError the file is as it was."""
         count = len(self._waiting)
         if not count:
             return None
@@ -251,7 +251,7 @@ def _keep_damaged_copy(path: Path, data: bytes, last_damaged: int) -> Path:
 
 
 def _ignore(text: str) -> None:
-    """Before `start` there is nothing to report."""
+    """Do nothing: before `start` there is nothing to report."""
 
 
 class JournalFile:

@@ -218,7 +218,7 @@ class OpenStand:
             self.guest.hold(fault)
 
     def _frames_are_due(self) -> bool:
-        """From the camera, which is powered."""
+        """Whether frames are due from the camera, which is powered."""
         return self.assembly.stand.imaging.supply.is_on and self.guest is not None and self.guest.frames_to_come
 
     def _release(self) -> None:

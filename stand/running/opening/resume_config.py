@@ -109,8 +109,8 @@ def _adapt_virtual_time(recorded: StandConfig, own: StandConfig) -> StandConfig:
 
 
 def _merge_cameras(recorded: StandConfig, own: StandConfig, session: Path) -> dict[str, CameraSettings]:
-    """Those of the session, by its names: where they are found is this stand's, what its frames depend on the
-    session's."""
+    """Merge the cameras of the session, by its names: where they are found is this stand's, what its frames depend on
+    the session's."""
     if missing := recorded.cameras.keys() - own.cameras.keys():
         raise ConfigError(
             f"{session}: was recorded with a camera {min(missing)}, and {own.name!r} has none of that name"

@@ -327,7 +327,7 @@ class Gatekeeper:
         access.tokens.watch(self._check_viewers)
 
     def _check_viewers(self) -> None:
-        """Those who would not be let in any more have to leave."""
+        """Disconnect the viewers who would not be let in any more."""
         for task, scope in self._viewers.items():
             with suppress(Denied):
                 if self._access.identify(scope) is not None:
@@ -357,7 +357,7 @@ class Gatekeeper:
             await _refuse(scope, answering, 500, FAILED.format(type(error).__name__))
 
     async def _view(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """As long as its token is known; Denied when that is taken back."""
+        """Serve a viewer as long as its token is known; Denied when that is taken back."""
         viewing = asyncio.ensure_future(self._app(scope, receive, send))
         self._viewers[viewing] = scope
         try:

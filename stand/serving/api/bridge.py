@@ -216,7 +216,7 @@ class Bridge:
             raise NoAnswer("the daemon has ended") from None
 
     def _begin_stop(self, who: Who, stopping: concurrent.futures.Future[BaseModel]) -> None:
-        """On the control loop."""
+        """Begin the stop, on the control loop."""
         if (wait_s := self._stopped_s + _STOPPED_S - time.monotonic()) > 0.0:
             self._loop.call_later(wait_s, self._begin_stop, who, stopping)
             return
@@ -226,7 +226,7 @@ class Bridge:
     def _call(
         self, call: Callable[[Served], Result | Awaitable[Result]], answer: concurrent.futures.Future[Result]
     ) -> None:
-        """On the control loop."""
+        """Call on the control loop."""
         if not self._is_open:
             answer.set_exception(NoAnswer("the daemon is ending"))
             return

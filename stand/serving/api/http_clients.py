@@ -123,7 +123,7 @@ class Clients:
         return await self._loop.create_server(lambda: self._make_client(door, None), sock=listening)
 
     def look_after(self) -> None:
-        """Drop clients whose time is over; to be called once a second."""
+        """Drop clients that do not read their answers; to be called once a second."""
         for client in [each for each in self._server.connections if isinstance(each, _Client)]:
             client.unread = client.unread + 1 if client.transport.get_write_buffer_size() else 0
             if client.unread > _UNREAD:

@@ -244,7 +244,7 @@ def _add_logins(router: APIRouter, access: Access, url: str) -> None:
 
 
 async def _send_stream(socket: WebSocket, stream: Stream, after: int | None) -> None:
-    """Until the viewer leaves, or does not take what is sent for half a minute."""
+    """Send the stream until the viewer leaves, or does not take what is sent for half a minute."""
     viewer = stream.join(after)
 
     async def send() -> None:

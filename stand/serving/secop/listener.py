@@ -129,7 +129,8 @@ class SecopListener:
         task.add_done_callback(self._ending.discard)
 
     def _drop_silent_clients(self, most: int) -> None:
-        """So that fewer than `most` are connected: the silent go, those first who have asked nothing that is SECoP."""
+        """Drop clients so that fewer than `most` are connected: the silent go, those first who have asked nothing that
+        is SECoP."""
         silent = sorted(self._clients, key=lambda client: (not client.is_stranger, -client.silent_s))
         for client in silent[: max(0, len(silent) - most + 1)]:
             self._send_away(client)
