@@ -88,13 +88,36 @@ def states(
     supply: Column | None = None,
     camera: Column | None = None,
 ) -> States:
-    """The camera's thermal state at F instants, for `model.correct(points, states(...))`: one state for all points, or
-    one for each.
+    """Compute the camera's thermal state at F instants, for `model.correct(points, states(...))`.
 
-    Of a session: at its frames, or at `time_ns` (F,), ascending. Of arrays: `time_ns` and, from the time before it on,
-    `air` near the camera, degC; `supply`, 0 or 1, until the next instant (else the camera is on); `camera`, its own
-    temperature between the frames, degC. camera_degC (F,): its own at the instants, where it is known better.
-    ValueError when neither a session nor `time_ns` with `air` is given, or shapes do not agree.
+    Give either a session, or arrays: `time_ns` and `air`, with `supply` and `camera` where they are known.
+
+    Parameters
+    ----------
+    model : DriftModel
+        The model that is asked; it decides what has to be remembered of the past.
+    session : Session, optional
+        The session that recorded the camera.
+    time_ns : (F,), optional
+        The instants, ascending. In a session they are by default those of its frames.
+    camera_degC : (F,), optional
+        The camera's own temperature at the instants, where it is known better.
+    air : (time_ns, degC), optional
+        The air near the camera, from the time before the instants on.
+    supply : (time_ns, 0 or 1), optional
+        Whether the camera is on, until the next instant. By default it is on.
+    camera : (time_ns, degC), optional
+        The camera's own temperature between the frames.
+
+    Returns
+    -------
+    States
+        F states: one for all points, or one for each point.
+
+    Raises
+    ------
+    ValueError
+        When neither a session nor `time_ns` with `air` is given, or shapes do not agree.
     """
     if session is None:
         if time_ns is None or air is None:
@@ -299,17 +322,41 @@ def observations_of(
     camera_serial: str = "",
     name: str = "arrays",
 ) -> Observations:
-    """F frames of N markers of one camera.
+    """Make observations of plain arrays: F frames of N markers of one camera.
 
-    centres_px (F, N, 2): (x, y), NaN where a marker is missing. camera_degC (F,): the camera's own, NaN: the frame is
-    not used. time_ns (F,): middle of the exposure, ascending; else a frame a second. chamber_degC (F,): the set-point,
-    whose frames are left out together to choose a model; else camera_degC in whole degrees. role (F,): of
-    experiments.steps.Role; else `reference` at the set-point nearest to reference_degC (else that of the first frame)
-    and `fit` at the others. air: (time_ns, degC), both (A,), near the camera, for the thermal form; with it
-    supply: (time_ns, 0 or 1), when the camera was off and on, else it was on all the time; camera: (time_ns, degC), its
-    own readings between the frames, else it is taken to go straight from one to the next. sigma_px: standard
-    uncertainty of a coordinate, where there is no covariance_px2 (F, N, 2, 2). image_size: (width, height), else what
-    holds the centres. ValueError when shapes do not agree, or something cannot be what it is given as.
+    Parameters
+    ----------
+    centres_px : (F, N, 2)
+        The centres (x, y) in px; NaN where a marker is missing.
+    camera_degC : (F,)
+        The camera's own temperature. A frame where it is NaN is not used.
+    time_ns : (F,), optional
+        The middle of each exposure, ascending. By default there is one frame a second.
+    chamber_degC : (F,), optional
+        The set-point, whose frames are left out together to choose a model. By default it is camera_degC in whole
+        degrees.
+    reference_degC : float, optional
+        The frames at the set-point nearest to it are the reference. By default that of the first frame is.
+    role : (F,), optional
+        Values of experiments.steps.Role. By default `reference` at the reference and `fit` at the others.
+    air : (time_ns, degC), both (A,), optional
+        The air near the camera, which the thermal form needs.
+    supply : (time_ns, 0 or 1), optional
+        When the camera was off and on, only together with air. By default it was on all the time.
+    camera : (time_ns, degC), optional
+        The camera's own readings between the frames, only together with air. By default its temperature is taken to go
+        straight from one frame to the next.
+    sigma_px : float
+        Standard uncertainty of a coordinate, where there is no covariance_px2.
+    covariance_px2 : (F, N, 2, 2), optional
+        The covariance of each centre.
+    image_size : (width, height), optional
+        In px. By default it is what holds the centres.
+
+    Raises
+    ------
+    ValueError
+        When shapes do not agree, or a value cannot be what it is given as.
     """
     centres, own = _check_centres(centres_px, camera_degC)
     if air is None and (supply is not None or camera is not None):

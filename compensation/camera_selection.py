@@ -52,6 +52,6 @@ def list_camera_frames(session: Session) -> list[int]:
 
 
 def _list_cameras(session: Session) -> tuple[str, ...]:
-    """In the order of the recording."""
+    """List the cameras of a session in the order of the recording."""
     channels = dict.fromkeys(meta.channel for meta in sorted(session.frame_metas(), key=attrgetter("published_ns")))
     return tuple(channel.removesuffix(".image") for channel in channels)

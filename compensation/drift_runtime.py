@@ -337,7 +337,7 @@ class Drift:
 
     @property
     def most_leverage(self):
-        """Of a state that is still near the calibrated ones."""
+        """The largest leverage of a state that is still near the calibrated ones."""
         return _MORE_LEVERAGE * self._model["leverage"]
 
 

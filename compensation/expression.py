@@ -128,7 +128,7 @@ def format_words(feature: Feature) -> str:
 
 
 def _bracket(feature: Any, level: int) -> str:
-    """In brackets where it binds less than what is around it."""
+    """Put a feature in brackets where it binds less than what is around it."""
     text = format_words(feature)
     while isinstance(feature, Expression) and feature[0] == "away":
         feature = feature[1]

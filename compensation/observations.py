@@ -247,12 +247,29 @@ def observe(
     incomplete: Say | None = None,
     camera: str | None = None,
 ) -> Observations:
-    """All frames of all sessions, found once. camera: by its name, of those that have several; none the leading one.
-    target: instead of the ones attached to the sessions. progress: such as foundation's. finder: how the
-    markers are found, else one frame after the other.
+    """Find the markers in all frames of all sessions, each frame once.
 
-    SessionError when a session has frames of two equilibria of the camera, unless `across_gap`, or when something of it
-    is missing, unless `incomplete` takes the sentence that says what.
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        The folders of the sessions.
+    progress : callable, optional
+        Reports the progress, such as foundation.progress.
+    target : Target, optional
+        Used instead of those that are attached to the sessions.
+    finder : Finder, optional
+        How the markers are found. By default one frame is searched after the other.
+    across_gap : bool
+        Accept frames of two equilibria of the camera in a session.
+    incomplete : callable, optional
+        Accept sessions of which something is missing; it gets the sentence that says what.
+    camera : str, optional
+        The name of the camera, in sessions of several. By default the leading one is taken.
+
+    Raises
+    ------
+    SessionError
+        When a session has frames of two equilibria without `across_gap`, or is incomplete without `incomplete`.
     """
     sessions = [open_whole(path, incomplete) for path in ([paths] if isinstance(paths, Path | str) else paths)]
     for session in sessions:

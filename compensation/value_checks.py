@@ -31,7 +31,7 @@ only, of at least 4.5e-6; a type prior and the calibrations of the tests pass.""
 
 
 def check_shape(name: str, values: object, shape: tuple[int, ...]) -> Float:
-    """As an array of this shape."""
+    """Return the values as an array of this shape, or refuse them."""
     try:
         array = np.array(values, np.float64)
     except ValueError as error:
@@ -101,6 +101,6 @@ def check_terms(name: str, terms_px: ArrayLike, image_size: tuple[int, int]) -> 
 
 
 def check_order(name: str, low_high: Pair) -> None:
-    """Of the ends of a range."""
+    """Check that the ends of a range are in order."""
     if not low_high[0] <= low_high[1]:
         raise ValueError(f"{name}: not low, high")

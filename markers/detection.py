@@ -380,12 +380,27 @@ def detect(
     noise: Noise | None = None,
     watch: Callable[[float], None] = _ignore_progress,
 ) -> Detection:
-    """The target's markers in a grey (height, width) or colour (height, width, 3; B G R) image, which is only read.
+    """Find the target's markers in an image, which is only read.
 
-    previous: the frame before, for speed and to keep the orientation; when the target has moved too far it is searched
-    for again. noise: the camera's; without it covariances come from the residuals, and chi is relative to this image's
-    median marker. watch: gets the part of a search that is done, 0 to 1. Raises DetectionError when the target cannot
-    be identified with certainty.
+    Parameters
+    ----------
+    image : (height, width) or (height, width, 3), uint8 or uint16
+        A grey image, or a colour image in the order B, G, R.
+    target : Target
+        The target to find.
+    previous : Detection, optional
+        The detection in the frame before, for speed and to keep the orientation. When the target has moved too far it
+        is searched for again.
+    noise : Noise, optional
+        The camera's noise. Without it covariances come from the residuals, and chi is relative to this image's median
+        marker.
+    watch : callable
+        Gets the part of a search that is done, 0 to 1.
+
+    Raises
+    ------
+    DetectionError
+        When the target cannot be identified with certainty.
     """
     grey = make_picture(convert_to_grey(image))
     if previous is not None:

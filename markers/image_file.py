@@ -29,7 +29,7 @@ _NO_IMAGE = (OSError, ValueError, SyntaxError, LookupError, EOFError, OverflowEr
 
 
 def read_image(path: Path | str) -> Image:
-    """A grey image (height, width) from a file, 8 or 16 bits; DetectionError when it cannot be read or is too large."""
+    """Read a grey image (height, width) of 8 or 16 bits; DetectionError when it cannot be read or is too large."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:

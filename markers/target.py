@@ -231,5 +231,5 @@ class Target(Document):
 
 
 def load_target(path: Path | str) -> Target:
-    """The target described by a YAML file; raises ConfigError naming the file and the path in it."""
+    """Load the target that a YAML file describes; ConfigError names the file and the path in it."""
     return load_document(Path(path), Target)

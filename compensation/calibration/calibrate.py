@@ -204,8 +204,26 @@ def calibrate(
 ) -> CameraCalibration:
     """Adjust, choose pinhole and degree of the rays by held-out positions, and compare the session's halves.
 
-    Without scores the pinhole is Brown's unless `model` says otherwise, and the rays are of the lowest degree.
-    sigma: of the table, else a TableSigma as it is. CalibrationError when the positions do not determine a camera.
+    Parameters
+    ----------
+    positions : Positions
+        The target as it was found at positions of the stages.
+    target : Target
+        The target that was moved.
+    sigma : TableSigma, optional
+        The uncertainty of the table; by default a TableSigma with its default values.
+    model : Model
+        The pinhole. With AUTO held-out positions decide.
+
+    Raises
+    ------
+    CalibrationError
+        When the positions do not determine a camera.
+
+    Notes
+    -----
+    Without scores at held-out positions the pinhole is Brown's unless `model` says otherwise, and the rays are of the
+    lowest degree.
     """
     board, sigma = make_board(target), sigma or TableSigma()
     known, no_scores = try_check(lambda: score_models(positions, board, sigma))

@@ -243,7 +243,7 @@ class CameraFile(Document):
 
 
 def load_camera(path: Path | str) -> CameraFile:
-    """The camera in a file that `save` wrote, number for number; SessionError when it is anything else."""
+    """Load the camera from a file that `save` wrote, number for number; SessionError when it is anything else."""
     return load_json(
         path, lambda text: CameraFile.model_validate_json(text, strict=True).check_sound(), "a camera file"
     )

@@ -178,10 +178,14 @@ class ViewCalibration:
 
 
 def calibrate_views(views: Views, board: Board) -> ViewCalibration:
-    """Brown's pinhole from views of a board; OpenCV gives the start.
+    """Calibrate Brown's pinhole from views of a board; OpenCV gives the start.
 
-    Rounds follow until the eccentricity of the discs, the outliers and the discrepancy are settled. CalibrationError
-    when the views are too few or too alike to determine a camera.
+    Rounds follow until the eccentricity of the discs, the outliers and the discrepancy are settled.
+
+    Raises
+    ------
+    CalibrationError
+        When the views are too few or too alike to determine a camera.
     """
     if len(views.centres_px) < LEAST_VIEWS:
         raise CalibrationError(f"{len(views.centres_px)} pictures show the target, {LEAST_VIEWS} are needed")

@@ -107,20 +107,21 @@ INDEX_COLUMNS = ("image", "frame", "time_ns", "camera_degC", "outside")
 def apply_model(
     model: ModelArgument,
     source: Annotated[Path, typer.Argument(metavar="POINTS.csv|IMAGE|SESSION", help="What is to be corrected.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write; of a session a new folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write; for a session a new folder.")],
     *,
     session: Annotated[
-        Path | None, typer.Option(help="Of points with time_ns, or an image: the session that recorded the camera.")
+        Path | None, typer.Option(help="For points with time_ns, or an image: the session that recorded the camera.")
     ] = None,
     time: Annotated[
-        str | None, typer.Option(help="Of an image: when it was taken, local time (2026-01-01T18:00:00) or time_ns.")
+        str | None, typer.Option(help="For an image: when it was taken, local time (2026-01-01T18:00:00) or time_ns.")
     ] = None,
     camera_degC: TemperatureOption = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="FIRST:END", help="Of a session: these frames, counted from 0, without END.")
+        str | None,
+        typer.Option(metavar="FIRST:END", help="For a session: only these frames, counted from 0, without END."),
     ] = None,
     form: Annotated[
-        ImageFormat, typer.Option("--format", help="Of images: tiff is float32, png rounded to the original's bits.")
+        ImageFormat, typer.Option("--format", help="For images: tiff is float32, png rounded to the original's bits.")
     ] = "tiff",
     camera: CameraName = None,
     incomplete: Incomplete = False,

@@ -48,7 +48,7 @@ def calibrate_session(
     report: Annotated[Path | None, typer.Option(help="A page (HTML) with residuals and uncertainty.")] = None,
     target: TargetOption = None,
     model: Annotated[
-        Model, typer.Option(help="The pinhole; auto: what does better at held-out positions.")
+        Model, typer.Option(help="The pinhole; auto takes what does better at held-out positions.")
     ] = Model.AUTO,
     linear_um: Annotated[float, typer.Option(min=0.001, help="Standard uncertainty of a linear position.")] = (
         1e3 * _TABLE.linear_mm
@@ -56,8 +56,12 @@ def calibrate_session(
     rotary_arcmin: Annotated[float, typer.Option(min=0.0001, help="Standard uncertainty of a rotary position.")] = (
         _TABLE.rotary_arcmin
     ),
-    straightness_um: Annotated[float, typer.Option(min=0, help="Of the table across its axis; 0: straight.")] = 0.0,
-    wobble_arcmin: Annotated[float, typer.Option(min=0, help="Of the table's tilt; 0: none.")] = 0.0,
+    straightness_um: Annotated[
+        float, typer.Option(min=0, help="Standard uncertainty across the table's axis; 0 if it is straight.")
+    ] = 0.0,
+    wobble_arcmin: Annotated[
+        float, typer.Option(min=0, help="Standard uncertainty of the table's tilt; 0 if it has none.")
+    ] = 0.0,
     keep_rays: Annotated[
         bool, typer.Option("--keep-rays", help="Write the ray model, too, when it does not describe the lens.")
     ] = False,
@@ -122,7 +126,7 @@ def format_summary(file: CameraFile, target: Target) -> str:
 
 
 def _format_projection(file: CameraFile) -> list[str]:
-    """Where the projection is known how well, and where nobody has looked."""
+    """Say how well the projection is known in each place, and where there was no marker."""
     sigma_px = np.array(file.uncertainty.sigma_px, np.float64)
     if not np.isfinite(sigma_px).any():
         return []

@@ -150,7 +150,7 @@ def fit(
     degree: DegreeOption = None,
     like: Annotated[
         list[Path] | None,
-        typer.Option(metavar="MODEL", help="A model of another unit of its type; of three or more."),
+        typer.Option(metavar="MODEL", help="A model of another unit of its type; give three or more."),
     ] = None,
     camera: CameraName = None,
     finding: MarkerSearch,
@@ -274,7 +274,7 @@ def report(
     *,
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
     budget: Annotated[
-        str | None, typer.Option(help="With the stand's budget, by its geometry: a file, or the installed `paper`.")
+        str | None, typer.Option(help="Show the stand's budget, by its geometry: a file, or the installed `paper`.")
     ] = None,
     validation: Annotated[
         Path | None, typer.Option(help="Show the result of `compensate validate`, too: the JSON file next to its page.")

@@ -25,7 +25,8 @@ TargetOption = Annotated[
     str | None, typer.Option("--target", help="A target file or an installed name; else the session's own.")
 ]
 CameraName = Annotated[
-    str | None, typer.Option("--camera", help="Of sessions of several cameras, by its name in the stand's file.")
+    str | None,
+    typer.Option("--camera", help="The camera to use in sessions of several, by its name in the stand's file."),
 ]
 DetailsOption = Annotated[
     Path | None,
@@ -90,7 +91,7 @@ def load_optional_target(name: str | None) -> Target | None:
 
 
 def make_warning_sink(incomplete: bool) -> Say | None:
-    """For `open_whole`: what is missing of a session is a warning with --incomplete, and else refused."""
+    """Make what `open_whole` takes: with --incomplete what is missing is a warning, otherwise it is refused."""
     return (lambda text: say(f"warning: {text}")) if incomplete else None
 
 

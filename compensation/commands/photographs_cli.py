@@ -119,7 +119,7 @@ def _offset_progress(report: Report, before: int) -> Report:
 
 
 def _list_pictures(folder: Path, names: list[str]) -> list[tuple[Path | None, str]]:
-    """Of each moment, None where the folder has none."""
+    """List the picture of each moment with its name; None where the folder has none."""
     return [(folder / name if (folder / name).exists() else None, f"{folder.name}/{name}") for name in names]
 
 

@@ -71,7 +71,7 @@ def whiten_steps(features: Float, hours: Float, variance_px2: Float, steps: Floa
 
 
 def scan_steps(white: WhitenedSteps, values_px: Float) -> StepScan:
-    """Of values (K,)."""
+    """Scan a series of values (K,), px, for steps."""
     own = white.inverse @ values_px
     without = -0.5 * ((own**2).sum(axis=1) + white.log_determinant)
     along = np.einsum("gkb,gk->gb", white.steps, own)
@@ -195,7 +195,10 @@ class SessionSeries:
 
 
 def build_session_series(observations: Observations, index: int) -> SessionSeries | None:
-    """Of session `index`; None with too few instants to tell. SessionError without anything to measure against."""
+    """Build the series of session `index`; None with too few instants.
+
+    SessionError when there is nothing to measure against.
+    """
     frames = observations.of(*_ROLES) & (observations.session == index)
     if not frames.any():
         return None
@@ -319,7 +322,7 @@ _MOST = 6
 
 
 def find_bumps(observations: Observations) -> tuple[Bump, ...]:
-    """Of all sessions, in order of time; none in a session with too few instants to tell."""
+    """Find the steps of all sessions, in order of time; a session with too few instants has none."""
     found: list[Bump] = []
     for index in range(len(observations.sessions)):
         try:

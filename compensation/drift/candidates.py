@@ -61,7 +61,7 @@ def check_folds(fold_chamber_degC: tuple[float, ...], fold_rms_px: tuple[Pair, .
 
 
 def make_pair(values: Float) -> Pair:
-    """Of (2,)."""
+    """Make a pair of an array of shape (2,)."""
     i, j = values.tolist()
     return i, j
 

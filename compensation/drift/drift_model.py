@@ -39,8 +39,8 @@ class Outside(IntFlag):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DriftModel(ABC):
-    """Maps measured positions of one camera to those at the reference temperature; made by choosing.fit, saved and
-    loaded by model_file.
+    """Maps measured positions of one camera to those at the reference temperature; made by model_selection.fit,
+    saved and loaded by model_file.
 
     form: paper or thermal. facts: what it was fitted to. discrepancy_px (2,): what the form leaves unexplained at
     temperatures not fitted, one standard deviation, marker noise taken off. candidates: the table of choice, of every

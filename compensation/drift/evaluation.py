@@ -77,8 +77,16 @@ class Evaluation:
 
 
 def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
-    """Score the model on the VALIDATION frames; a session without any is scored by leaving out one temperature at a
-    time, each time with a new fit of the same terms. SessionError when the frames are of another camera or target."""
+    """Score the model on the VALIDATION frames.
+
+    Sessions without any are scored by leaving out one temperature at a time, each time with a new fit of the same
+    terms.
+
+    Raises
+    ------
+    SessionError
+        When the frames are of another camera or target.
+    """
     check_same(model, observations)
     observations = correct_bumps(observations, model.facts.bumps)
     frames = observations.of(Role.VALIDATION)
@@ -161,7 +169,7 @@ def _group_by_temperature(rows: Displacements, after: Float) -> tuple[Temperatur
 
 
 def compute_improvement_percent(before_px: float, after_px: float) -> float:
-    """By how much the RMS has shrunk; negative when it has grown, NaN when there was nothing to shrink."""
+    """Return by how much the RMS has shrunk, %; negative when it has grown, NaN when it was 0 before."""
     return 100 * (1 - after_px / before_px) if before_px > 0 else float("nan")
 
 

@@ -66,7 +66,7 @@ class _Visit:
 
 
 def compute_hysteresis(observations: Observations, model: DriftModel | None = None) -> tuple[Hysteresis, ...]:
-    """Of each session that has reference frames; after compensation with `model`, before it without."""
+    """Compute hysteresis in each session that has reference frames, with `model` after compensation, else before."""
     if model is not None:
         observations = correct_bumps(observations, model.facts.bumps)
     found: list[Hysteresis] = []
@@ -78,7 +78,7 @@ def compute_hysteresis(observations: Observations, model: DriftModel | None = No
 
 
 def _collect_visits(observations: Observations, own: Mask, model: DriftModel | None) -> list[_Visit]:
-    """In order of time; frames of one set-point that follow each other are a visit."""
+    """Collect the visits in order of time; frames of one set-point that follow each other are a visit."""
     rows = compute_displacements(observations, own)
     place = -rows.displacement_px
     if model is not None:
@@ -124,7 +124,7 @@ def _compute_session_hysteresis(session_id: str, visits: list[_Visit]) -> Hyster
 
 
 def _compute_branch_differences(visits: list[_Visit]) -> Iterator[BranchDifference]:
-    """By set-point, the mean of the visits from below minus that of the visits from above."""
+    """Compute for each set-point the mean of the visits from below minus that of the visits from above."""
     for chamber_degC in sorted({visit.chamber_degC for visit in visits}):
         sides = [
             [visit for visit in visits if visit.chamber_degC == chamber_degC and visit.from_below is side]
@@ -147,7 +147,7 @@ def _make_branch_difference(chamber_degC: float, difference: Float, variance: Fl
 
 
 def _compute_repeatability_px(visits: list[_Visit]) -> Float:
-    """From the differences of all pairs of visits of the same set-point from the same side."""
+    """Compute it from the differences of all pairs of visits of the same set-point from the same side."""
     pairs = [
         np.nanmean(one.place_px - other.place_px, axis=0)
         for one, other in combinations(visits, 2)

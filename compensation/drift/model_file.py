@@ -132,12 +132,12 @@ def save_model(model: DriftModel, path: Path | str) -> None:
 
 
 def load_model(path: Path | str) -> DriftModel:
-    """The model in a file that `save_model` wrote, number for number; SessionError when it is anything else."""
+    """Load the model from a file that `save_model` wrote, number for number; SessionError when it is anything else."""
     return load_json(path, lambda text: _build_model(_ANY.validate_json(text, strict=True)), "a drift model")
 
 
 def _build_model(file: PaperFile | ThermalFile) -> DriftModel:
-    """With its other form; ValueError when its parts, or the two, do not fit together."""
+    """Build a model and its other form; ValueError when its parts, or the two, do not fit together."""
     model = _build_paper_model(file) if isinstance(file, PaperFile) else _build_thermal_model(file)
     if file.other is None:
         return model

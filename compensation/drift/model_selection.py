@@ -30,16 +30,35 @@ Say = Callable[[str], None]
 def fit(
     observations: Observations, degree: int | None = None, form: Form | None = None, say: Say = lambda sentence: None
 ) -> DriftModel:
-    """The model of these sessions.
+    """Fit the drift model to these sessions.
 
-    form: None takes the one that predicts better what was left out: temperatures between others and, where these were
-    recorded, frames on the way and after switching on; the paper's if both do;
-    sessions that support one of them only have that. degree: of the paper's form, which it implies. The model has the
-    form that was not taken as `other`, where the sessions support it; else `say` gets the sentence that says why they
-    do not. SessionError when they cannot support what was asked for, or a degree was given for thermal.
+    Parameters
+    ----------
+    observations : Observations
+        The frames of one camera and target.
+    degree : int, optional
+        Degree of the paper's form, which it implies. By default cross-validation chooses it.
+    form : "paper" or "thermal", optional
+        By default the form that better predicts what was left out is taken: temperatures between others and, where
+        these were recorded, frames on the way and after switching on. The paper's is taken when both predict equally
+        well. Sessions that support only one form get that one.
+    say : callable
+        Gets the sentence that says why the sessions do not support the form that was not taken.
 
-    It is fitted around steps that no thermal state explains (`facts.bumps`): frames on the other side of one count as
-    if the camera had not been moved, and are as uncertain as the step is.
+    Returns
+    -------
+    DriftModel
+        Its `other` is the form that was not taken, where the sessions support it.
+
+    Raises
+    ------
+    SessionError
+        When the sessions cannot support what was asked for, or a degree was given for the thermal form.
+
+    Notes
+    -----
+    The model is fitted around steps that no thermal state explains (`facts.bumps`): frames on the other side of a step
+    count as if the camera had not been moved, and are as uncertain as the step is.
     """
     check_request(degree, form)
     bumps = find_bumps(observations)

@@ -121,10 +121,21 @@ def rereference(model: DriftModel, observations: Observations, frames: Mask | No
     """The thermal form of the model, for this session: it takes points of it to where the model's first session has its
     reference, as if nothing had been moved in between, with the uncertainty of that.
 
-    frames (F,): of the session, by default its REFERENCE frames; where they were taken in another thermal state than
-    the model's reference, that is taken into account. SessionError when the model has no thermal form, the session is
-    of another camera or target, there is more than one, no frame of a known thermal state is usable, or the target is
-    more than 10 px away.
+    Parameters
+    ----------
+    model : DriftModel
+        A model with a thermal form.
+    observations : Observations
+        One session of the model's camera and target.
+    frames : (F,) of bool, optional
+        The frames to use, by default the session's REFERENCE frames. Where they were taken in another thermal state
+        than the model's reference, that is taken into account.
+
+    Raises
+    ------
+    SessionError
+        When the model has no thermal form, the session is of another camera or target, there is more than one session,
+        no frame of a known thermal state is usable, or the target is more than 10 px away.
     """
     thermal = get_thermal_form(model)
     check_same(thermal, observations)

@@ -77,7 +77,7 @@ class Term(Document):
 
     @property
     def symbol(self) -> str:
-        """Its feature in a formula."""
+        """The symbol of its feature in a formula."""
         return format_words(self.feature)
 
     @classmethod
@@ -108,7 +108,7 @@ class CameraTerm(Term):
 
 
 class CameraSquaredTerm(Term):
-    """Its square."""
+    """The square of the camera's temperature."""
 
     kind = "camera squared"
 

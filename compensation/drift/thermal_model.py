@@ -55,7 +55,7 @@ class BetweenSessions:
 
     @property
     def text(self) -> str:
-        """In a sentence."""
+        """A sentence that says how well sessions repeat."""
         i, j = (1e3 * sigma_px for sigma_px in self.sigma_px)
         if self.is_assumed:
             return (

@@ -106,7 +106,22 @@ class Finder:
 
 
 def finder(workers: int = 1, cluster: str | None = None, *, use_cache: bool = True) -> Finder:
-    """As the command line has it; ConfigError when both ways of sharing the work are asked for."""
+    """Make the finder that the options of the command line describe.
+
+    Parameters
+    ----------
+    workers : int
+        Processes that search for markers in parallel.
+    cluster : str, optional
+        Address (host:port) of a Dask scheduler whose workers see the same files.
+    use_cache : bool
+        Keep the markers found, and reuse those kept.
+
+    Raises
+    ------
+    ConfigError
+        When both ways of sharing the work are asked for, or workers is less than 1.
+    """
     if workers < 1:
         raise ConfigError(f"--workers is 1 or more, not {workers}")
     if cluster is not None and workers > 1:

@@ -83,7 +83,7 @@ def format_utc(instant: str) -> str:
 
 
 def format_orientation(roll_deg: float) -> str:
-    """Of a camera, against the first one."""
+    """Say how a camera is turned against the first one."""
     if math.isnan(roll_deg):
         return "camera"
     return "normal camera" if abs(roll_deg) < _ROLLED_DEG else f"camera rotated by {abs(roll_deg):z.1f}°"
@@ -154,7 +154,7 @@ _LIBRARIES = ("thermostand", "numpy", "scipy", "opencv-python-headless")
 
 
 def render_datasheet_page(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str:
-    """As HTML text; the same data give the same text."""
+    """Render the datasheet as HTML text; the same data give the same text."""
     unknown: dict[str, list[str]] = {}
     for one in sheet.quantities:
         if one.why:
@@ -246,7 +246,7 @@ def _read_versions() -> dict[str, str]:
 
 
 def render_calibration_page(file: CameraFile, calibration: CameraCalibration) -> str:
-    """As HTML text; the same data give the same text."""
+    """Render the calibration as HTML text; the same data give the same text."""
     drawn = {
         "residuals": page_figures.draw_residual_vectors,
         "sizes": page_figures.draw_residual_sizes,
@@ -261,13 +261,13 @@ def render_calibration_page(file: CameraFile, calibration: CameraCalibration) ->
 
 
 def render_validation_page(validation: SpatialValidation) -> str:
-    """As HTML text; the same validation gives the same text."""
+    """Render the validation as HTML text; the same validation gives the same text."""
     title = f"Validation of {validation.session_id} in three dimensions"
     return render_page("validation", title, draw_validation_figures(validation), validation=validation)
 
 
 def draw_validation_figures(validation: SpatialValidation) -> Iterator[NamedFigure]:
-    """Of that page, and of a report's part."""
+    """Draw the figures of that page, which are also those of a part of the report."""
     yield "bars", page_figures.draw_deviation_bars(validation)
     for number, one in enumerate(variant for variant in (validation.after, validation.with_stand) if variant):
         yield f"positions-{number}", page_figures.draw_by_position(validation, one)

@@ -134,8 +134,28 @@ def write_report(
     extras: Extras | None = None,
     draw: Draw = render_in_turn,
 ) -> None:
-    """Write page and numbers, each whole or not at all; without a model the drift alone. draw: how the figures are
-    drawn. SessionError when the place refuses."""
+    """Write the report's page and its numbers, each whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The HTML file; the numbers are written next to it under the same name with the suffix .json.
+    observations : Observations
+        The frames of the sessions.
+    model : DriftModel, optional
+        Without a model the report shows the drift alone.
+    evaluation : Evaluation, optional
+        What the model gains on held-out frames.
+    extras : Extras, optional
+        More parts of the report.
+    draw : callable
+        How the figures are drawn.
+
+    Raises
+    ------
+    SessionError
+        When the place cannot be written.
+    """
     extras, path = extras or Extras(), Path(path)
     numbers = collect_numbers(observations, model, evaluation, extras)
     write_atomically(path, _render_observations(observations, evaluation, numbers, extras, draw))

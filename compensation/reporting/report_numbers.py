@@ -208,7 +208,7 @@ class ReportNumbers:
 @dataclass(frozen=True, slots=True)
 class Extras:
     """budgets: the stand's, by session id. positions: where the table stood. validation: in three dimensions.
-    equipment: as the sessions tell it. details: as somebody has stated it."""
+    equipment: as the sessions record it. details: as an operator has stated them."""
 
     budgets: Mapping[str, Budget] = field(default_factory=dict[str, Budget])
     positions: TablePositions = field(default_factory=TablePositions)
@@ -487,7 +487,7 @@ def format_compact(value: float, u: float) -> str:
 
 
 def list_table_positions(sessions: Sequence[Sequence[StepMark]]) -> TablePositions:
-    """Of the steps of all these sessions. SessionError when they do not record where the table stood."""
+    """List the places in the steps of these sessions. SessionError when they do not record where the table stood."""
     return TablePositions(_list_places(sessions, Role.CALIBRATION), _list_places(sessions, Role.POSE))
 
 

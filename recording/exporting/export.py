@@ -82,8 +82,24 @@ def export(
 ) -> None:
     """Write `session` as the folder `out`, which must not exist, laid out as above; memory stays flat.
 
-    `report` gets the share of the work that is done (0 to 1) and what is being done. SessionError when the session
-    cannot be read, `out` not be written, or the format needs a package that is missing; `out` then does not appear.
+    Parameters
+    ----------
+    session : Session
+        The session to export.
+    out : path
+        The folder to make.
+    frames : bool
+        Whether images are written.
+    telemetry : table format, optional
+        The format of the tables; None leaves them out.
+    report : callable
+        Gets the share of the work that is done (0 to 1) and what is being done.
+
+    Raises
+    ------
+    SessionError
+        When the session cannot be read, `out` cannot be written, or the format needs a package that is missing; `out`
+        then does not appear.
     """
     if telemetry is not None:
         check_format(telemetry)

@@ -90,7 +90,7 @@ def _register_channel(writer: Writer, topic: Topic) -> int:
 
 
 def _merge_messages(session: Session, frames: bool, telemetry: bool) -> Iterator[RecordedMessage]:
-    """In order of time as far as each series is."""
+    """Merge the messages in order of time, as far as each series is in order."""
     of_telemetry = iterate_recorded_messages(session) if telemetry else iter(())
     of_frames = _iterate_frame_messages(session) if frames else iter(())
     return heapq.merge(of_telemetry, of_frames, key=attrgetter("time_ns"))

@@ -59,7 +59,7 @@ class ReplayClock:
         await self._wall.sleep_until(self._wall_start_ns + math.ceil((time_ns - self._start_ns) / self._speed))
 
     def hold(self) -> AbstractContextManager[None]:
-        """As far as the wall clock can be held."""
+        """Hold the time, as far as the wall clock can be held."""
         return self._wall.hold()
 
 
@@ -151,5 +151,5 @@ def _copy_journal(session: Session, folder: Path) -> None:
 
 
 def _make_settings(commit_s: float) -> RecordingSettings:
-    """Without the rules of a stand for a nearly full disk: a copy may fill it, and says nothing of it."""
+    """Make settings without the rules of a stand for a nearly full disk: a copy may fill it without an alert."""
     return RecordingSettings(telemetry_commit_s=commit_s, stop_frames_below_bytes=0, alert_below_fraction=0.0)

@@ -39,14 +39,18 @@ BLOCK_BYTES = 1 << 20
 
 
 def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
-    """What was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; returns `out`.
+    """Write what was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; return `out`.
 
     Attachments, channels, sequence numbers, instants and order stay, and so do the metadata, which state the extent of
     the part and what was already missing in the session. The first messages are an event of kind
     TRIMMED, when a step had started and not ended before `begin_ns` its mark again, and when UTC was not the stand's
     time an event that says so, all at the instant of the first message kept: a frame's step can be looked up, and
-    nothing lies before the part. SessionError when nothing
-    was recorded in the range, or when reading or writing fails; `out` then does not appear.
+    nothing lies before the part.
+
+    Raises
+    ------
+    SessionError
+        When nothing was recorded in the range, or reading or writing fails; `out` then does not appear.
     """
     places = [place for place in _iterate_places(session) if begin_ns <= place.time_ns < end_ns]
     kept = _select_records(session, begin_ns, end_ns)
@@ -102,7 +106,7 @@ def _describe_range(session: Session) -> str:
 
 
 def _make_opening(session: Session, first_ns: int, begin_ns: int, end_ns: int) -> Iterator[MessageRecord]:
-    """Where the part comes from, and the mark of the step under way."""
+    """Make the messages that state where the part comes from, and the mark of the step under way."""
     name, utc = session.metadata.get("session_id", session.path.name), session.utc
     text = f"trimmed from session {name}: {utc.utc_text(begin_ns)} up to {utc.utc_text(end_ns)}, the end not included"
     mark = _find_step_under_way(session, begin_ns)

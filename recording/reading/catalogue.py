@@ -82,7 +82,7 @@ class ListedSession:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """The name of its folder."""
         return self.path.name or self.path.resolve().name
 
     @property
@@ -185,8 +185,8 @@ def _is_deleted(name: str) -> bool:
 
 
 def _list_files(path: Path) -> list[_File] | None:
-    """Those that a session consists of; None when there is no segment. One that a living recorder has open counts as
-    another file."""
+    """List the files that a session consists of; None when there is no segment. One that a living recorder has open
+    counts as another file."""
     found: list[_File] = []
     place = os.fspath(path)  # path objects, and context managers but for the folders, would double the time of a list
     for series in (TELEMETRY, FRAMES):

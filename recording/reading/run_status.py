@@ -46,7 +46,7 @@ def find_last_run_event(events: Iterable[Event]) -> Event | None:
 def determine_run_outcome(
     events: Iterable[Event], journal: JournalFacts | None, *, is_recording: bool = False
 ) -> RunOutcome:
-    """By the recording or by its journal, whichever has the later entry."""
+    """Decide by the recording or by its journal, whichever has the later entry."""
     if is_recording:
         return RunOutcome.RUNNING
     last = find_last_run_event(events)
@@ -74,17 +74,17 @@ class Extent:
     run: RunOutcome
 
     def text(self, utc: UtcOffsets) -> str:
-        """As a sentence."""
+        """Describe the extent in a sentence."""
         span = f"{utc.date_time(self.begin_ns)} to {utc.local_text(self.end_ns)}"
         return f"a part of the session {self.session_id}: {span}; the run's journal and its other part are not in it"
 
     def record(self) -> str:
-        """For the session record of the part."""
+        """Return it as text for the session record of the part."""
         return json.dumps({**asdict(self), "run": str(self.run)}, separators=(",", ":"))
 
 
 def parse_extent(session: Mapping[str, str]) -> Extent | None:
-    """By a session's record; None for what is no part, or where it is not understood."""
+    """Read the extent from a session's record; None for what is no part, or where it is not understood."""
     fields = parse_json_object(session.get("extent", ""))
     if fields is None:
         return None

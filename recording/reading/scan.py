@@ -227,7 +227,7 @@ class Scan:
         return self.files is Files.SOUND
 
     def sentences(self, files: Files) -> tuple[str, ...]:
-        """Of what makes the files that."""
+        """Return the sentences about what puts the files in that state."""
         return tuple(finding.sentence for finding in self.findings if finding.files is files)
 
     @property
@@ -262,8 +262,10 @@ def _no_report(share: float, text: str) -> None:
 
 
 def verify(path: Path, report: Report = _no_report) -> Scan:
-    """Read the whole session in `path`; `report` gets the bytes read so far and the segment. SessionError when `path`
-    is no session. Damage is not raised, it is found."""
+    """Read every byte of the session in `path`. Damage is not raised, it is among the findings of the result.
+
+    `report` gets the bytes read so far and the segment. SessionError when `path` is no session.
+    """
     return scan(path, Depth.BYTES, report)
 
 
@@ -758,7 +760,10 @@ class _SessionScanner:
         yield from loose
 
     def _has_camera_degC(self) -> bool | None:
-        """By the descriptions of the frames, as far as the first that has one; None without any description."""
+        """Whether the camera states its temperature, by the descriptions up to the first that has one.
+
+        None without any description.
+        """
         found = None
         for meta in self._recorded.metas if self._depth is not Depth.ENDS else self._iterate_first_metas():
             if not math.isnan(meta.camera_degC):
@@ -844,7 +849,7 @@ class Shortage:
 
     @property
     def hole(self) -> Hole:
-        """As a stretch of the frames."""
+        """Return the shortage as a stretch of the frames."""
         return Hole(
             series=FRAMES,
             first=None,
@@ -857,9 +862,11 @@ class Shortage:
 
 
 def find_shortages(marks: Iterable[StepMark], events: Sequence[Event], metas: Iterable[FrameMeta]) -> list[Shortage]:
-    """By the steps that are done, in order of time, and all the frames that are there. A step's end is recorded when
-    all its frames are on the disk, or counted as lost: so a capture that is done has as many of each camera as it
-    says."""
+    """Find shortages by the steps that are done, in order of time, and all the frames.
+
+    A step's end is recorded when all its frames are on the disk, or counted as lost: so a capture that is done
+    has as many of each camera as it says.
+    """
     begins_ns = find_restart_times(events)
     counts: Counter[tuple[str, str]] = Counter()
     channels: set[str] = set()

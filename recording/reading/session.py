@@ -203,7 +203,7 @@ class Session:
 
     @cached_property
     def utc(self) -> UtcOffsets:
-        """From its instants to UTC as the host's system clock had it."""
+        """The offsets from the session's instants to UTC, as the host's system clock had it."""
         return collect_offsets(self.events())
 
     @property
@@ -332,7 +332,7 @@ class Session:
         return self.scanned.run
 
     def _check(self, segment: Path) -> Head:
-        """Its head; SessionError when the segment is not of this session, or not of this place in it."""
+        """Return the head of a segment; SessionError when that is not of this session, or not of this place in it."""
         if segment in self._heads:
             return self._heads[segment]
         try:
@@ -361,16 +361,29 @@ class _Unreadable(FileDamaged):
 
 
 def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
-    """The session in `path`; SessionError when something of it is missing or was never finished, unless `incomplete`
-    takes the sentence that says what. Frames that were never acknowledged, or that the recorder itself reported as
-    lost, are not missing."""
+    """Open the session in `path` if it is whole.
+
+    Frames that were never acknowledged, or that the recorder itself reported as lost, do not count as missing.
+
+    Parameters
+    ----------
+    path : path
+        The folder of the session.
+    incomplete : callable, optional
+        Accept a session that is not whole; it gets the sentence that says what is missing.
+
+    Raises
+    ------
+    SessionError
+        When something is missing or was never finished, and `incomplete` is not given.
+    """
     session = Session.open(path)
     check_whole(session, incomplete)
     return session
 
 
 def check_whole(session: Session, incomplete: Say | None = None) -> None:
-    """As above, for a session that is open."""
+    """Check as `open_whole` does that a session that is open is whole."""
     path = session.path
     _check_finished(path, incomplete)
     missing = [hole.text(session.utc) for hole in session.holes if not hole.excused]

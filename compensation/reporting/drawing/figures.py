@@ -201,12 +201,12 @@ def make_text(x: float, y: float, text: str, colour: str) -> Mark:
 
 
 def make_sequential_colormap() -> Colormap:
-    """Of values from low to high: plasma without its yellow, which does not show on white."""
+    """Make the colours of values from low to high: plasma without its yellow, which does not show on white."""
     return ListedColormap(mpl.colormaps["plasma"](np.linspace(0, 0.88, 256)))
 
 
 def set_image_axes(axes: Axes, image_size: tuple[int, int]) -> None:
-    """Those of an image (width, height), px."""
+    """Set axes to those of an image (width, height), px."""
     width, height = image_size
     axes.set(xlabel="column I (px)", ylabel="row J (px)", xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_aspect("equal")
@@ -233,7 +233,7 @@ def draw_arrows(
 
 
 def _draw_scale_bar(axes: Axes, image_size: tuple[int, int], length_px: float, text: str) -> None:
-    """At the lower left of an image, what a motion looks like that is drawn so long."""
+    """Draw at the lower left of an image how long a motion of this size is drawn."""
     width, height = image_size
     x, y = 0.03 * width, 0.965 * height
     axes.plot([x, x + length_px], [y, y], color=ON_PALE, linewidth=2, solid_capstyle="butt")
@@ -358,14 +358,14 @@ Draw = Callable[[Sequence[Named]], list[str]]
 
 
 def render_in_turn(figures: Sequence[Named]) -> list[str]:
-    """In this process."""
+    """Render the figures one after the other in this process."""
     return [render_svg(figure, name) for figure, name in figures]
 
 
 # Figures go through files: a pool whose process is killed while a long message is in its pipe waits for ever.
 @contextmanager
 def open_renderer(workers: int) -> Generator[Draw]:
-    """With two or more workers one process more, which loads what it needs from now on."""
+    """Open a renderer: with two or more workers one more process, which loads what it needs from now on."""
     if workers < 2:
         yield render_in_turn
         return
