@@ -124,6 +124,8 @@ def _read_chunk_contents(data: memoryview) -> ChunkContents:
     for opcode, record in iterate_records(data):
         if opcode == Opcode.MESSAGE:
             channel, _, time_ns, _ = MESSAGE.unpack_from(record)
+            if time_ns >> 63:  # a chunk's head has signed instants, so none agrees with it: readers refuse it, too
+                raise ValueError(f"a message has the instant {time_ns}, which no clock gives")
             contents.messages[channel] += 1
             contents.places.setdefault(channel, []).append((time_ns, offset))
         elif opcode == Opcode.SCHEMA:
