@@ -40,7 +40,6 @@ _LONG_FILES = {
 }
 _TOGETHER = {
     # Real devices belong to one program by their serial numbers, whatever their addresses.
-    "tests/system/test_queue_wires.py",
     "tests/system/test_camera_lost.py",
     "tests/system/test_camera_wire.py",
     "tests/system/test_failure_table.py",

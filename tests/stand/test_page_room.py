@@ -86,7 +86,9 @@ async def test_each_reason_to_hold_has_its_words():
     assert [reason for reason in REASON_TEXTS if f"{reason}: " not in text] == []
 
 
-@pytest.mark.parametrize("name", ["../page_room.py", "..%2Fpage_room.py", "%2e%2e%2fdesk.py", "nothing.js", ".", "%00"])
+@pytest.mark.parametrize(
+    "name", ["../page_routes.py", "..%2Fpage_routes.py", "%2e%2e%2fapi_models.py", "nothing.js", ".", "%00"]
+)
 async def test_no_other_file_is_given(night, name):
     status, _, data = await ask(night, f"/static/{name}")
     assert status in (400, 404)

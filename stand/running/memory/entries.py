@@ -1,5 +1,5 @@
 """What happens to a run, entry by entry. RunState is folded from them; those that outlive the daemon are lines of its
-journal (recording/reading/format_lines.py).
+journal (recording/format/journal_lines.py).
 
     Begun        the run, its plan and the texts it was made of; the first line and no other
     StepChanged  a step was started, or is done
