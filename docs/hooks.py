@@ -20,14 +20,16 @@ from pydantic import TypeAdapter
 from typer.main import get_command
 
 from thermostand.compensation.cli import app as compensate
+from thermostand.compensation.commands.schema_cli import DOCUMENTS as OFFLINE
 from thermostand.compensation.drift.model_file import PaperFile, ThermalFile
 from thermostand.experiments.steps import STEPS, Step
+from thermostand.foundation.schemas import make_schema
 from thermostand.stand.commands.command_table import app as stand
+from thermostand.stand.commands.config_cli import DOCUMENTS
 from thermostand.stand.commands.remedies import make_troubleshooting_page
 from thermostand.stand.config.reference import make_reference
 
 ROOT = Path(__file__).parents[1]
-SCHEMAS = ROOT / "configs" / "schema"
 OPENAPI = ROOT / "tests" / "golden" / "data" / "openapi.json"  # a test holds that it is what a stand answers
 NOTEBOOK = ROOT / "docs" / "tutorials" / "simulated-session.ipynb"
 FILES = {
@@ -43,7 +45,7 @@ FILES = {
 def on_files(files: Files, config: Any) -> Files:
     """Add a page for each schema, and the notebook as it was last executed."""
     for name, (page, title) in FILES.items():
-        schema = json.loads((SCHEMAS / f"{name}.json").read_text(encoding="utf-8"))
+        schema = make_schema({**DOCUMENTS, **OFFLINE}[name])
         files.append(File.generated(config, f"reference/{page}.md", content=make_reference(title, schema)))
     if not NOTEBOOK.exists():
         return files

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -19,7 +19,7 @@ from thermostand.foundation.document_faults import (
     format_path,
 )
 from thermostand.foundation.errors import ConfigError, NotFound, SessionError
-from thermostand.foundation.files import describe_unreadable, write_atomically
+from thermostand.foundation.files import describe_unreadable
 
 if TYPE_CHECKING or not yaml.__with_libyaml__:
     from yaml import SafeLoader as QuickLoader
@@ -188,23 +188,3 @@ def _count_values(node: yaml.Node, known: dict[int, int]) -> int:
         parts = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
         known[id(node)] = 1 + sum(_count_values(part, known) for part in parts)
     return known[id(node)]
-
-
-# JSON Schemas of documents, for editors: generated from the models, so that they always agree.
-
-
-def format_schema(model: type[BaseModel]) -> str:
-    """The schema of documents of this model."""
-    schema = model.model_json_schema()
-    return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
-
-
-def write_schemas(directory: Path, documents: Mapping[str, type[BaseModel]]) -> tuple[Path, ...]:
-    """Write NAME.json for each kind of document; SessionError when the place refuses."""
-    with suppress(OSError):  # what cannot be made cannot be written into either, which is reported
-        directory.mkdir(parents=True, exist_ok=True)
-    written: list[Path] = []
-    for name, model in documents.items():
-        write_atomically(directory / f"{name}.json", format_schema(model))
-        written.append(directory / f"{name}.json")
-    return tuple(written)

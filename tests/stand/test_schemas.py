@@ -1,4 +1,4 @@
-"""The JSON Schemas of what a user edits: current, named in each file, and true of each installed one."""
+"""The JSON Schemas of what a user edits: printed and written by commands, and true of each installed file."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.commands.schema_cli import DOCUMENTS as OFFLINE
-from thermostand.foundation.documents import format_schema
+from thermostand.foundation.schemas import make_schema
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.commands.config_cli import DOCUMENTS
 
@@ -31,7 +31,7 @@ KINDS = {
 
 
 def validator(kind: str) -> Draft202012Validator:
-    return Draft202012Validator(json.loads(format_schema(ALL[kind])))
+    return Draft202012Validator(make_schema(ALL[kind]))
 
 
 def as_json(value: object) -> Any:
@@ -41,12 +41,6 @@ def as_json(value: object) -> Any:
     if isinstance(value, list):
         return [as_json(each) for each in value]
     return value.isoformat() if isinstance(value, datetime) else value
-
-
-@pytest.mark.parametrize("kind", ALL)
-def test_the_schemas_are_current(kind: str):
-    """When not: stand config schema, compensate schema."""
-    assert (CONFIGS / "schema" / f"{kind}.json").read_text() == format_schema(ALL[kind])
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -74,11 +68,30 @@ def test_a_recipe_that_waits_until_settled_fits():
         assert [fault.message for fault in validator("recipe").iter_errors(recipe)] == []
 
 
-def test_the_commands_write_them_at_the_place_given(tmp_path: Path):
-    for app, words in ((stand, ["config", "schema"]), (compensate, ["schema"])):
-        result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "new" / "folder")])
+COMMANDS = ((stand, ["config", "schema"], DOCUMENTS), (compensate, ["schema"], OFFLINE))
+
+
+def test_the_commands_write_them_at_the_place_given_and_print_them(tmp_path: Path):
+    folder = tmp_path / "new" / "folder"
+    for app, words, kinds in COMMANDS:
+        result = CliRunner().invoke(app, [*words, "--out", str(folder)])
         assert result.exit_code == 0, result.output
-    assert {path.stem for path in (tmp_path / "new" / "folder").iterdir()} == set(ALL)
+        assert result.stdout.split() == [str(folder / f"{kind}.json") for kind in kinds]
+        for kind in kinds:
+            printed = json.loads(CliRunner().invoke(app, [*words, kind]).stdout)
+            assert json.loads((folder / f"{kind}.json").read_text()) == printed
+            Draft202012Validator.check_schema(printed)
+        assert json.loads(CliRunner().invoke(app, words).stdout).keys() == kinds.keys()
+    assert {path.stem for path in folder.iterdir()} == set(ALL)
+
+
+def test_one_kind_alone_is_written_and_another_is_refused(tmp_path: Path):
+    for app, words, kinds in COMMANDS:
+        kind = next(iter(kinds))
+        assert CliRunner().invoke(app, [*words, kind, "--out", str(tmp_path)]).exit_code == 0
+        refused = CliRunner().invoke(app, [*words, "nothing", "--out", str(tmp_path)])
+        assert (refused.exit_code, refused.stderr.count("\n"), kind in refused.stderr) == (2, 1, True)
+    assert {path.name for path in tmp_path.iterdir()} == {"stand.json", "geometry.json"}
 
 
 def test_a_place_that_refuses_is_reported(tmp_path: Path):
