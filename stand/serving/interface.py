@@ -17,7 +17,7 @@ from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import check_ports, serve
 from thermostand.stand.serving.commands import Served
 from thermostand.stand.serving.page_data import PageData
-from thermostand.stand.serving.secop.listener import make_secop_listener
+from thermostand.stand.serving.secop import make_secop_listener
 
 HERE = "127.0.0.1"
 

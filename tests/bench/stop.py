@@ -33,7 +33,7 @@ DAEMON = """
 import asyncio, sys
 from pathlib import Path
 from thermostand.stand.serving.api.listeners import Interface
-from thermostand.stand.serving.secop.listener import make_secop_listener
+from thermostand.stand.serving.secop import make_secop_listener
 from tests.stand.fake_service import FakeService, serve_fake
 
 async def run():

@@ -20,7 +20,7 @@ from thermostand.stand.serving.api_models import (
     StandState,
     Who,
 )
-from thermostand.stand.serving.secop.listener import make_secop_listener
+from thermostand.stand.serving.secop import make_secop_listener
 
 AT = Argument(name="position", unit="mm", minimum=0, maximum=280)
 WARM = Argument(name="setpoint_degC", unit="degC", minimum=-10, maximum=60)

@@ -24,7 +24,7 @@ from thermostand.stand.commands.serve_cli import TokenReloader
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
 from thermostand.stand.serving.api.access import COOKIE, STOP_PATH, TokenStore
 from thermostand.stand.serving.api.listeners import Interface
-from thermostand.stand.serving.secop.listener import make_secop_listener
+from thermostand.stand.serving.secop import make_secop_listener
 
 OTHER = "another-token-of-rose-that-is-new"
 PAUSE = "/api/v1/run/pause"

@@ -11,7 +11,7 @@ from tests.stand.secop_service import JAM, NO, WIRE, SecopService, node
 from tests.stand.secop_talk import talking
 from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.serving.api_models import FaultState, HeatByHand
-from thermostand.stand.serving.secop.secop_lines import SecopRequest, make_message, parse_request
+from thermostand.stand.serving.secop import SecopRequest, make_message, parse_request
 
 
 @pytest.mark.parametrize(
@@ -246,6 +246,6 @@ async def test_a_run_and_a_trip_refuse_orders_with_classes_of_their_own(tmp_path
 
 
 async def test_a_control_loop_that_hangs_is_an_error_and_no_old_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("thermostand.stand.serving.secop.node._OLD_S", -1.0)
+    monkeypatch.setattr("thermostand.stand.serving.secop._OLD_S", -1.0)
     async with node(SecopService(), tmp_path) as port, talking(port) as talk:
         assert (await talk.asked("read chamber"))[2][0] == "CommunicationFailed"

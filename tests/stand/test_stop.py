@@ -26,7 +26,7 @@ from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.stop_thread import StopThread
 from thermostand.stand.serving.api_models import Who
 from thermostand.stand.serving.client import find_session_server
-from thermostand.stand.serving.secop.listener import make_secop_listener
+from thermostand.stand.serving.secop import make_secop_listener
 
 LIMIT_S = 5.0
 STOP = b"POST /api/v1/run/stop HTTP/1.1\r\nHost: localhost\r\n"

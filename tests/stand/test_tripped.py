@@ -39,7 +39,7 @@ from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve
 from thermostand.stand.serving.client import Server, find_session_server, make_server
-from thermostand.stand.serving.secop.listener import make_secop_listener
+from thermostand.stand.serving.secop import make_secop_listener
 
 FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC", "hold")
 NOTHING, SECOP_ERROR = "", 400
