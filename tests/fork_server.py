@@ -62,7 +62,7 @@ _LOADED = {
 """What such a program imports on its way, too."""
 _HELPER = "thermostand.foundation.worker_process"
 """It is given the module whose calls it makes."""
-STARTERS = ("thermostand.stand.simulator", "thermostand.foundation.worker_process")
+STARTERS = ("thermostand.stand.assembly.simulator", "thermostand.foundation.worker_process")
 """Modules that start such programs themselves."""
 _AT_THE_START = ("PYTHONPATH", "LD_PRELOAD", "NUMBA_CACHE_DIR", "PYTHONWARNINGS")
 """Who changes one of these gets a program of its own: they count while modules are loaded."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.stand import simulator
+from thermostand.stand.assembly import simulator
 
 
 def install(

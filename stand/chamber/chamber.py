@@ -18,7 +18,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.compressor import CompressorFile, load_state
 from thermostand.stand.chamber.permit_renewer import PermitRenewer
 from thermostand.stand.chamber.permits import PermitLimits, Permits
-from thermostand.stand.interlock import Interlock
+from thermostand.stand.safety.interlock import Interlock
 
 _OCCUPIED_AGAIN_S = 5.0  # round number; nothing was measured
 _STEP_K = 0.5  # of a set-point that is brought to its place no faster than the cameras may follow

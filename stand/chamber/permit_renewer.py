@@ -15,7 +15,7 @@ from thermostand.foundation.errors import DeviceError
 from thermostand.foundation.events import PERMIT_NOT_RENEWED, SWITCHED_OFF
 from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.permits import Permission, Permits
-from thermostand.stand.fault import get_value
+from thermostand.stand.safety.fault import get_value
 
 SUPERVISION_PERIOD_S = 2.5  # between looks at relays and regulator while nothing is permitted: off again within 5 s
 

@@ -29,8 +29,8 @@ from thermostand.stand.commands.remedies import get_next_command
 from thermostand.stand.commands.sessions.session_text import format_size
 from thermostand.stand.commands.status_snapshot import SET_POINT, describe_manual_heat, list_unsafe_parts
 from thermostand.stand.commands.verbs import order
-from thermostand.stand.gate import ENDINGS, HELD, INTERLOCK, STOPPING
-from thermostand.stand.latch import LatchedFault
+from thermostand.stand.safety.gate import ENDINGS, HELD, INTERLOCK, STOPPING
+from thermostand.stand.safety.latch import LatchedFault
 from thermostand.stand.service.stand_service import describe_hold
 from thermostand.stand.serving.api_models import FaultState, RunStatus, StandState
 from thermostand.stand.serving.client import API, Answer, Server

@@ -27,7 +27,7 @@ from thermostand.foundation.output import get_output
 from thermostand.foundation.usage import escape_line
 from thermostand.stand.commands.status_snapshot import StatusSnapshot, format_event, make_snapshot
 from thermostand.stand.estimating.run_estimate import PlanEstimate
-from thermostand.stand.gate import HELD, RELEASED
+from thermostand.stand.safety.gate import HELD, RELEASED
 from thermostand.stand.service.run import Front, serve_by_socket
 from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.listeners import Interface

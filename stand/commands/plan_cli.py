@@ -18,6 +18,7 @@ from thermostand.foundation.command_app import App
 from thermostand.foundation.instants import format_local, format_utc
 from thermostand.foundation.output import say, show
 from thermostand.foundation.stop_signal import StopSignal
+from thermostand.stand.assembly.simulator import Simulator, describe_laboratory, list_faults
 from thermostand.stand.commands.endpoint import (
     ConfigArgument,
     ConfigOption,
@@ -31,7 +32,6 @@ from thermostand.stand.estimating.learned_durations import load_learned_duration
 from thermostand.stand.estimating.missing_devices import list_missing_devices
 from thermostand.stand.estimating.run_estimate import estimate_plan
 from thermostand.stand.running.order import load_order
-from thermostand.stand.simulator import Simulator, describe_laboratory, list_faults
 
 app = App()
 

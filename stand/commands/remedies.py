@@ -6,9 +6,9 @@ import inspect
 from collections.abc import Mapping
 
 from thermostand.foundation.events import GUARD, KINDS, EventKind, get_advice
-from thermostand.stand import gate as gate
 from thermostand.stand.guarding import guard as guard
 from thermostand.stand.guarding import rules as rules  # these three register rows of their own
+from thermostand.stand.safety import gate as gate
 
 _HEAD = """# Troubleshooting
 

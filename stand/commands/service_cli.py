@@ -17,7 +17,7 @@ from thermostand.foundation.files import write_atomically
 from thermostand.foundation.output import say, show
 from thermostand.stand.commands.endpoint import ConfigArgument, ConfigOrOption, choose_config
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
-from thermostand.stand.latch import SYSTEM_FOLDER
+from thermostand.stand.safety.latch import SYSTEM_FOLDER
 from thermostand.stand.serving.instances import STANDS_FOLDER
 
 app = App()

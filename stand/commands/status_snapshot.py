@@ -10,7 +10,7 @@ from typing import cast
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.instants import format_local
 from thermostand.stand.commands.remedies import get_next_command
-from thermostand.stand.gate import REASON_TEXTS
+from thermostand.stand.safety.gate import REASON_TEXTS
 from thermostand.stand.serving.api_models import StandState
 from thermostand.stand.serving.client import API, Server
 

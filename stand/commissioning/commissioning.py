@@ -20,7 +20,7 @@ from thermostand.drivers.devices.device_check import Add, DeviceCheck, Finding
 from thermostand.drivers.devices.kinds import Equipment
 from thermostand.drivers.settings import Identity
 from thermostand.foundation.errors import DeviceError, InUse, Unreachable
-from thermostand.stand.assembly import Assembly, load_unit_map
+from thermostand.stand.assembly.assemble import Assembly, load_unit_map
 from thermostand.stand.commissioning.moves import MovementChecks
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.run_estimate import find_existing

@@ -11,9 +11,9 @@ from thermostand.drivers.devices.cameras.camera_gige import Settings as GigeSett
 from thermostand.drivers.wires import genicam_feature_names as words
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import DeviceError, Unreachable
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory
 from thermostand.stand.config.simulation import SimulatedCamera
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 _NAME = "camera"
 _SET_BY = (*words.EXPOSURE, *words.EXPOSURE_STEP_US, *words.NECESSARY, "TriggerSoftware")

@@ -18,7 +18,7 @@ from thermostand.foundation.errors import DeviceError, StandError, StandTripped,
 from thermostand.foundation.events import DEAD_MAN_TESTED, HOME_RESIDUAL, HOME_RESIDUAL_LARGE
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Quality
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
 
 _FRAMES = 6  # enough for a rate; round number, nothing was measured
 _SLOW = 0.8  # of the longest travel that the stand's file allows

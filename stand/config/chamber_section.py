@@ -6,6 +6,8 @@ from pydantic import Field
 
 from thermostand.foundation.documents import Document
 
+BAND_K = 0.5  # the air is at its set-point: five digits of the regulator's display
+
 
 class ChamberConfig(Document):
     """What is known of the chamber from commissioning; a third more or less does no harm.

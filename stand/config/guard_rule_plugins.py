@@ -14,7 +14,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.events import GUARD, KINDS, guard_rule
 from thermostand.foundation.plugins import check_settings, load_row
-from thermostand.stand.fault import Watch
+from thermostand.stand.safety.fault import Watch
 
 GROUP = "thermostand.guard_rules"
 

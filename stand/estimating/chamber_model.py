@@ -23,8 +23,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.recording.reading.session import Session
-
-BAND_K = 0.5  # the air is at its set-point: five digits of the regulator's display
+from thermostand.stand.config.chamber_section import BAND_K
 
 _ARRIVAL_LEVELS_K = (4.0, 2.0, 1.0, BAND_K)
 _LEAST_RAMP_K = 1.5  # smaller steps drown in the display's 0.1 K

@@ -15,7 +15,7 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.events import AT_AMBIENT, NOT_AT_AMBIENT, PLAN_CHANGED, SOAK_LONGER, TO_AMBIENT
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.stand.estimating.estimate import PricedStep
-from thermostand.stand.gate import HELD, RELEASED
+from thermostand.stand.safety.gate import HELD, RELEASED
 
 # Round numbers; nothing was measured.
 _REMEMBERED = 9  # the last measurements of a kind of work count

@@ -19,9 +19,9 @@ from thermostand.foundation.events import SENSOR, SENSOR_BELIEVED, get_guard_kin
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Quality, Reading
 from thermostand.stand.config.guard_section import SensorsConfig
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.interlocks import SENSOR_STALE
 from thermostand.stand.guarding.stuck_sensor import FINE_STEP_K, SENSOR_STUCK
+from thermostand.stand.safety.fault import Fault
 
 SENSOR_JUMPED = guard_rule("sensor_jumped", "a temperature jumped by more than a body can", SENSOR)
 SENSOR_OUTSIDE = guard_rule("sensor_outside", "a temperature is where it cannot be", SENSOR)

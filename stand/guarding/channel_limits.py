@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import CONNECTED, guard_rule
 from thermostand.stand.config.guard_section import ChannelLimits
-from thermostand.stand.fault import DONE, Fault, Readings, Rule, Watch
+from thermostand.stand.safety.fault import DONE, Fault, Readings, Rule, Watch
 
 CHANNEL_LIMIT = guard_rule(
     "channel_limit",

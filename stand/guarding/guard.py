@@ -14,13 +14,13 @@ from thermostand.foundation.clock import NS_PER_S, Clock, to_ns
 from thermostand.foundation.errors import DeviceError
 from thermostand.foundation.events import GUARD_LATE, HOLD_ENDED, HOLD_STAYS, guard_rule
 from thermostand.foundation.hub import Hub
-from thermostand.stand.fault import Fault, Watch
 from thermostand.stand.guarding.interlocks import (
     NOT_RECORDED,
 )
 from thermostand.stand.guarding.step_errors import StepErrors
-from thermostand.stand.latch import Latch
-from thermostand.stand.safety import Safety
+from thermostand.stand.safety.fault import Fault, Watch
+from thermostand.stand.safety.latch import Latch
+from thermostand.stand.safety.making_safe import Safety
 
 _GUARD_FAILED = guard_rule("guard_failed", "the guard itself has failed")
 LATE_PERIODS = 2  # one look may be late by as much as a period without anything being wrong

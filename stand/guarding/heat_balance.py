@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.stand.config.chamber_section import ChamberConfig, HeatBalanceConfig
-from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.plausibility import make_stateful_rule
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value
 
 NO_HEAT_RESPONSE = guard_rule("no_heat_response", "the regulator heats hard, and a probe does not show it")
 TOO_MUCH_HEAT = guard_rule("too_much_heat", "more heat was given within an hour than the chamber ever needs")

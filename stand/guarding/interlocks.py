@@ -9,7 +9,7 @@ from typing import Protocol
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import CONNECTED, SENSOR, guard_rule
 from thermostand.foundation.readings import Quality
-from thermostand.stand.fault import Fault, Readings, Rule, get_value
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value
 
 OVER_TEMPERATURE = guard_rule("over_temperature", "a temperature is above its limit")
 SENSOR_MISSING = guard_rule("sensor_missing", "a temperature that heat depends on was never read", CONNECTED)

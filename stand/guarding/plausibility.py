@@ -15,7 +15,7 @@ from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.foundation.readings import Reading
 from thermostand.stand.config.guard_section import CoolingConfig, HeaterOffConfig
-from thermostand.stand.fault import Fault, Readings, Rule, get_value, is_suspect
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value, is_suspect
 
 WARMING_WHILE_OFF = guard_rule("warming_while_off", "the air warms though nothing heats")
 COOLING_IN_VAIN = guard_rule("cooling_in_vain", "cold is given and the air does not cool")

@@ -13,8 +13,6 @@ from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.stand.config.dew import compute_dew_point_degC
 from thermostand.stand.config.guard_rule_plugins import load_rule
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.fault import DONE, Readings, Rule, Watch, get_value
-from thermostand.stand.gate import HELD, OPERATOR, RELEASED
 from thermostand.stand.guarding.channel_check import LEAST_LAG_S, ChannelModel
 from thermostand.stand.guarding.channel_limits import limit_watches
 from thermostand.stand.guarding.heat_balance import limit_heat_energy, require_heat_response
@@ -52,6 +50,8 @@ from thermostand.stand.guarding.startup_response import require_startup_response
 from thermostand.stand.guarding.steady_state_power import limit_output_deviation
 from thermostand.stand.guarding.stuck_sensor import forbid_stuck_sensor, forbid_stuck_while_other_moves
 from thermostand.stand.guarding.thermal_crosscheck import crosscheck_by_camera, crosscheck_by_granite
+from thermostand.stand.safety.fault import DONE, Readings, Rule, Watch, get_value
+from thermostand.stand.safety.gate import HELD, OPERATOR, RELEASED
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",

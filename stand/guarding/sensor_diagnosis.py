@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.stand.config.chamber_section import ChamberConfig
-from thermostand.stand.fault import Fault, Readings, Rule, get_value, is_suspect
 from thermostand.stand.guarding.heat_balance import compute_heat_percent
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value, is_suspect
 
 _EVERY_S, _KEPT_S = 10.0, 3600.0
 _BEFORE_S = 300.0  # from which a body's own trend is taken

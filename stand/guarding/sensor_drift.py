@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import SENSOR, guard_rule
-from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.plausibility import make_stateful_rule
 from thermostand.stand.guarding.sensor_diagnosis import Suspicion
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value
 
 SENSOR_DRIFTS = guard_rule("sensor_drifts", "two sensors of the same air drift apart while it is at rest", SENSOR)
 _NEAR_K = 1.0  # of the set-point, or it is not held

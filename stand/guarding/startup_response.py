@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from thermostand.foundation.clock import to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.stand.config.chamber_section import StartupResponseConfig
-from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.heat_balance import compute_heat_percent
 from thermostand.stand.guarding.plausibility import make_stateful_rule
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value
 
 FIRST_HEAT = guard_rule("first_heat", "the temperature does not rise where the first heat is given")
 _HEATS_PERCENT = 40.0  # that no chamber can take without getting warmer

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from thermostand.foundation.clock import to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.stand.config.chamber_section import SteadyStatePowerConfig
-from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.heat_balance import compute_heat_percent
 from thermostand.stand.guarding.plausibility import make_stateful_rule
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value
 
 OUTPUT_NOT_AS_NEEDED = guard_rule(
     "output_not_as_needed", "the regulator needs another output than before for the same set-point"

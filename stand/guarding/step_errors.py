@@ -14,11 +14,11 @@ from thermostand.foundation.errors import DeviceAlarm, DeviceError, GarbledReply
 from thermostand.foundation.events import guard_rule
 from thermostand.foundation.items import Batch, Item
 from thermostand.foundation.readings import Quality
-from thermostand.stand.fault import Fault, Readings, Watch
 from thermostand.stand.guarding.interlocks import (
     DEVICE_FAULT,
     STAGE_ALARM,
 )
+from thermostand.stand.safety.fault import Fault, Readings, Watch
 
 DEVICE_LOST = guard_rule("device_lost", "a step met a device that does not answer")
 

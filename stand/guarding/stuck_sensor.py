@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 
 from thermostand.foundation.clock import to_ns
 from thermostand.foundation.events import SENSOR, guard_rule
-from thermostand.stand.fault import Fault, Readings, Rule, get_value, is_suspect
 from thermostand.stand.guarding.plausibility import Scatter, make_stateful_rule
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value, is_suspect
 
 SENSOR_STUCK = guard_rule("sensor_stuck", "a temperature stays exactly where it is while it must move", SENSOR)
 FINE_STEP_K = 0.02

@@ -15,8 +15,8 @@ from statistics import fmean
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.stand.config.chamber_section import CameraCrosscheckConfig, GraniteCrosscheckConfig
-from thermostand.stand.fault import Fault, Readings, Rule, get_value
 from thermostand.stand.guarding.plausibility import make_stateful_rule
+from thermostand.stand.safety.fault import Fault, Readings, Rule, get_value
 
 AIR_WARMER_THAN_SHOWN = guard_rule(
     "air_warmer_than_shown", "a body in the chamber warms as if the air were warmer than shown"

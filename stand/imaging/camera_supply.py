@@ -15,12 +15,12 @@ from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.foundation.events import CAMERA_SUPPLY_OFF
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.tasks import cancel_all
-from thermostand.stand.gate import CAMERA_LOST, Gate
 from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_down, get_last_temperature
 from thermostand.stand.imaging.camera_recovery import LOST_LIMIT_S, RETRY_S, CameraRecovery
 from thermostand.stand.imaging.cameras import Cameras
 from thermostand.stand.imaging.equilibrium import CAMERA, CameraEquilibrium
-from thermostand.stand.interlock import Interlock
+from thermostand.stand.safety.gate import CAMERA_LOST, Gate
+from thermostand.stand.safety.interlock import Interlock
 
 _BOOT_LIMIT_S = 60.0  # round number; nothing was measured
 

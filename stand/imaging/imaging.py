@@ -13,12 +13,12 @@ from thermostand.foundation.errors import Unreachable
 from thermostand.foundation.events import CAMERA_BACK, CAMERA_LOST
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import TEMPERATURE_SUSPECT, Frame
-from thermostand.stand import gate as reasons
 from thermostand.stand.config.stand_config import LEADING
-from thermostand.stand.gate import Gate
 from thermostand.stand.imaging.camera_recovery import LOST_LIMIT_S, RETRY_S
 from thermostand.stand.imaging.camera_supply import CameraSupply
-from thermostand.stand.interlock import Interlock, Motions
+from thermostand.stand.safety import gate as reasons
+from thermostand.stand.safety.gate import Gate
+from thermostand.stand.safety.interlock import Interlock, Motions
 
 
 class Imaging:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from thermostand.experiments.steps import SoakUntilSettled
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.stand.estimating.chamber_model import BAND_K
+from thermostand.stand.config.chamber_section import BAND_K
 
 if TYPE_CHECKING:
     from thermostand.markers.detection import Detection

@@ -13,7 +13,7 @@ from thermostand.foundation.documents import parse_document, read_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.markers.target import Target
-from thermostand.stand.assembly import make_devices
+from thermostand.stand.assembly.assemble import make_devices
 from thermostand.stand.config.check_record import ATTACHMENT, load_check_record
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config

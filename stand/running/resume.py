@@ -28,7 +28,7 @@ from thermostand.recording.reading.run_status import RunOutcome, find_last_run_e
 from thermostand.recording.reading.scan import scan
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, salvage_unfinished
-from thermostand.stand.assembly import list_recorded_devices as declared_devices
+from thermostand.stand.assembly.assemble import list_recorded_devices as declared_devices
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.executing.actions import find_cold_start_steps
 from thermostand.stand.running.executing.camera_gap import CameraHistory, load_camera_history

@@ -37,13 +37,11 @@ from thermostand.markers.target import Target
 from thermostand.recording.reading.run_status import RunOutcome
 from thermostand.recording.writing.disk import NOTES_LINE, DiskCalls
 from thermostand.recording.writing.recorder import Recorder
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
+from thermostand.stand.assembly.stand import Stand
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.run_estimate import estimate_plan
-from thermostand.stand.fault import Fault, get_value
-from thermostand.stand.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
 from thermostand.stand.guarding.rules import AIR, LABORATORY, compute_dew_limit_degC, list_cold_parts
-from thermostand.stand.interlock import Interlocked
 from thermostand.stand.running.executing.camera_gap import OffsetGap, OffsetWatch, explain_possible_power_loss
 from thermostand.stand.running.executing.decisions import Decider
 from thermostand.stand.running.executing.executor import Executor
@@ -59,8 +57,10 @@ from thermostand.stand.running.resume import Interruption, hash_plan, make_begin
 from thermostand.stand.running.run_control import RunControl
 from thermostand.stand.running.session_report import DECIDES
 from thermostand.stand.running.status import EtaSlip, StatusBoard
+from thermostand.stand.safety.fault import Fault, get_value
+from thermostand.stand.safety.gate import DISK_LOW, INTERLOCK, NOT_RECORDED, Gate
+from thermostand.stand.safety.interlock import Interlocked
 from thermostand.stand.serving.api.server import preload
-from thermostand.stand.stand import Stand
 
 # The end of a run whose plan is done: the chamber comes back to the laboratory's temperature, so that a person who
 # opens it finds nothing cold that water would settle on, and nothing hot.

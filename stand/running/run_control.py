@@ -14,10 +14,9 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.recording.reading.notes import add_note, add_tags, check_tag
 from thermostand.recording.writing.disk import DiskCalls
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.estimate import price_plan
-from thermostand.stand.gate import OPERATOR
 from thermostand.stand.running.executing.executor import Executor
 from thermostand.stand.running.memory.entries import make_edit
 from thermostand.stand.running.memory.fold import apply_entry, find_refusal
@@ -26,6 +25,7 @@ from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import find_plan_faults
 from thermostand.stand.running.status import STATES, StatusBoard
+from thermostand.stand.safety.gate import OPERATOR
 from thermostand.stand.serving.api_models import (
     PlanCheck,
     PlanStep,

@@ -24,7 +24,7 @@ from thermostand.recording.format.images import MarkerWindows
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
-from thermostand.stand.assembly import Assembly, list_recorded_devices
+from thermostand.stand.assembly.assemble import Assembly, list_recorded_devices
 from thermostand.stand.config.stand_config import RecordingConfig, StandConfig
 from thermostand.stand.estimating.missing_devices import list_missing_devices
 from thermostand.stand.running.order import Order

@@ -7,9 +7,9 @@ from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 
 from thermostand.foundation.errors import ConfigError, Refused, Unreachable
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
+from thermostand.stand.assembly.simulator import ControlSocket
 from thermostand.stand.serving.api_models import Conflict, FaultRequest, Missing, SimulatedFaults
-from thermostand.stand.simulator import ControlSocket
 
 _ANSWERS_S = 5.0  # round number; nothing was measured
 

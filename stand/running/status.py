@@ -15,10 +15,10 @@ from thermostand.foundation.readings import Quality
 from thermostand.recording.writing.recorder import Recorder
 from thermostand.stand.estimating.eta import Eta
 from thermostand.stand.estimating.run_estimate import PlanEstimate
-from thermostand.stand.gate import HELD, RELEASED, Gate, Phase
-from thermostand.stand.latch import Latch
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.safety.gate import HELD, RELEASED, Gate, Phase
+from thermostand.stand.safety.latch import Latch
 from thermostand.stand.serving.api_models import RunStatus
 
 # Says when the end of a run moves: an event each time it is later by another tenth of the whole.

@@ -26,7 +26,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Reading
 from thermostand.foundation.repeat_limit import RepeatLimit
 from thermostand.recording.format.images import encode_png
-from thermostand.stand.assembly import Assembly, assemble, load_unit_map
+from thermostand.stand.assembly.assemble import Assembly, assemble, load_unit_map
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.open_stand import make_safe, open_bench
 from thermostand.stand.running.opening.stop import Stop

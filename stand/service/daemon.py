@@ -37,7 +37,6 @@ from thermostand.foundation.tasks import cancel_all, describe_failure, run_with_
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.estimating.learned_durations import learn_durations
-from thermostand.stand.fault import Fault
 from thermostand.stand.running.executing.settling_watch import preload_for
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import STOPPED, Stop, catch_signals
@@ -45,6 +44,7 @@ from thermostand.stand.running.opening.writer_restarts import WriterRestarts
 from thermostand.stand.running.resume import Interruption, repair_session
 from thermostand.stand.running.run import Job
 from thermostand.stand.running.run_control import save_note
+from thermostand.stand.safety.fault import Fault
 from thermostand.stand.service import systemd
 from thermostand.stand.service.counters import Counters, CountersFile, StoredCounters
 from thermostand.stand.service.host import Host

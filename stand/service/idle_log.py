@@ -33,7 +33,7 @@ from thermostand.recording.reading.run_status import RunOutcome
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.disk import DiskProcess
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, Recorder
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
 from thermostand.stand.running.session_files import make_recorder, make_session_info, publish_identities
 
 BETWEEN_RUNS = "idle-log"  # in place of a recipe's name

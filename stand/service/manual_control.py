@@ -15,7 +15,7 @@ from thermostand.drivers.devices.kinds import Verb, Work
 from thermostand.experiments.steps import MoveTo, SetTemperature, Step, number_steps
 from thermostand.foundation.errors import ConfigError, DeviceError
 from thermostand.foundation.items import Batch
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
 from thermostand.stand.estimating.estimate import price_plan
 from thermostand.stand.serving.api_models import Argument, Conflict, DeviceState, DeviceVerb, Missing
 

@@ -46,7 +46,8 @@ from thermostand.recording.format.manifest import SessionInfo
 from thermostand.recording.repair.salvage import BEING_RECORDED, Salvaged, format_salvaged, salvage_unfinished
 from thermostand.recording.writing.disk import REPAIR_LINE, DiskCalls, DiskProcess
 from thermostand.recording.writing.recorder import COMPLETE_WITHIN_S, FINISH_WITHIN_S, Recorder
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory, relocate
 from thermostand.stand.config.safe_ranges import describe_accepted
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.opening.clock_watch import ClockWatch
@@ -69,7 +70,6 @@ from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.alerts import send_alerts
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory, relocate
 
 # A real stand's file as a rehearsal: the simulated laboratory answers in the place of its devices.
 

@@ -25,7 +25,7 @@ from thermostand.foundation.worker_process import WorkerProcess
 from thermostand.foundation.workers import WorkerThread
 from thermostand.recording.repair.salvage import format_salvaged, salvage_unfinished
 from thermostand.recording.writing.disk import FILES_LINE
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.check_record import ATTACHMENT
 from thermostand.stand.config.safe_ranges import describe_accepted
 from thermostand.stand.config.stand_config import StandConfig

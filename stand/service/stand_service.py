@@ -14,7 +14,7 @@ from pydantic import ConfigDict, Field, JsonValue
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.recording.reading.notes import LONGEST_NOTE
-from thermostand.stand.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
+from thermostand.stand.safety.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
 from thermostand.stand.serving.api_models import (
     LONGEST_RECIPE,
     Conflict,

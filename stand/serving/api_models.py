@@ -21,8 +21,8 @@ from thermostand.recording.reading.notes import LONGEST_NOTE, TAG
 
 if TYPE_CHECKING:
     from thermostand.foundation.hub import Hub
+    from thermostand.stand.assembly.stand import Stand
     from thermostand.stand.config.stand_config import StandConfig
-    from thermostand.stand.stand import Stand
 
 # socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. network: TCP without one,
 # which STOP needs not. secop: SECoP on this machine. terminal: a signal or key.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 
 from pydantic import JsonValue
 
-from thermostand.stand.estimating.chamber_model import BAND_K
+from thermostand.stand.config.chamber_section import BAND_K
 from thermostand.stand.serving.api_models import DeviceState, DeviceVerb, ReadingState, RunStatus, StandState
 from thermostand.stand.serving.commands import STOP, Command
 

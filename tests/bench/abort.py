@@ -28,19 +28,19 @@ from thermostand.foundation.clock import WallClock, to_ns
 from thermostand.foundation.errors import StandTripped
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.tasks import cancel_all
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory
+from thermostand.stand.assembly.stand import Devices, Stand
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
-from thermostand.stand.fault import Watch
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import (
     limit_temperature,
 )
 from thermostand.stand.imaging.camera_supply import SupplyLimits
 from thermostand.stand.running.opening.stop import Interrupted, Stop
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
-from thermostand.stand.stand import Devices, Stand
+from thermostand.stand.safety.fault import Watch
 
 TRIPS = 60  # of each kind
 LIMIT_ms = 20.0

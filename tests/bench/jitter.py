@@ -24,9 +24,9 @@ from thermostand.foundation.clock import WallClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item
 from thermostand.foundation.readings import Frame
+from thermostand.stand.assembly.simulator import Simulator, describe_laboratory
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_real
-from thermostand.stand.simulator import Simulator, describe_laboratory
 
 FRAMES = 101  # so that the 99th percentile is not the longest
 INTERVAL_s = 0.5

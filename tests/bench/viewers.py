@@ -21,7 +21,8 @@ from tests.bench import abort, jitter
 from tests.bench.figures import Figure, report_progress, require_aravis
 from tests.bench.waiting import run_waiting_process
 from tests.system.simulated_orders import simulated_order
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
+from thermostand.stand.assembly.stand import Stand
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.opening.stop import Interrupted, Stop
 from thermostand.stand.service.stand_service import StandService
@@ -30,7 +31,6 @@ from thermostand.stand.serving.api.server import serve
 from thermostand.stand.serving.api_models import Who
 from thermostand.stand.serving.client import Server, find_session_server
 from thermostand.stand.serving.instances import list_daemons
-from thermostand.stand.stand import Stand
 
 VIEWERS = 10
 TRIPS = 60

@@ -18,9 +18,9 @@ from tests.system.simulated_orders import simulated_order
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark, StepState
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import pin_to_one_cpu, run_virtual
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 ROUNDS = 5
 SOAK_s = 1800.0

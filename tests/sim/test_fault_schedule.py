@@ -22,8 +22,8 @@ from thermostand.drivers.sim.laboratory_faults import (
 )
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
+from thermostand.stand.assembly.simulator import describe_laboratory
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.simulator import describe_laboratory
 
 START_NS = 1_767_290_400_000_000_000
 S = 1_000_000_000

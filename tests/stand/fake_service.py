@@ -17,9 +17,9 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.gate import INTERLOCK, OPERATOR, Gate
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.run_control import check_edit
+from thermostand.stand.safety.gate import INTERLOCK, OPERATOR, Gate
 from thermostand.stand.service.stand_service import (
     CancelRequest,
     DeviceRequest,

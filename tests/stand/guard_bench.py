@@ -7,11 +7,11 @@ from thermostand.foundation.clock import Clock, VirtualClock, to_ns
 from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
-from thermostand.stand.fault import Fault, Readings, Rule, Watch
-from thermostand.stand.gate import Gate
 from thermostand.stand.guarding.guard import Guard
-from thermostand.stand.latch import Latch, LatchFile
-from thermostand.stand.safety import Safety
+from thermostand.stand.safety.fault import Fault, Readings, Rule, Watch
+from thermostand.stand.safety.gate import Gate
+from thermostand.stand.safety.latch import Latch, LatchFile
+from thermostand.stand.safety.making_safe import Safety
 
 
 class PlainActuator:

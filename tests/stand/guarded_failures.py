@@ -9,8 +9,8 @@ from multiprocessing.connection import Connection
 
 from tests.stand.guarded_chamber import AIR, GRANITE, Action, Chamber, iterate_timed
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.rules import Announcements, make_watches
+from thermostand.stand.safety.fault import Fault
 
 LITTLE_K = 0.3  # how much too low a stuck probe is
 AFTER_TRIP_S = 1200.0

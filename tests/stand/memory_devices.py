@@ -17,13 +17,13 @@ from thermostand.foundation.errors import StandError
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Frame, Quality, Reading
+from thermostand.stand.assembly.stand import Devices, Stand
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import COMPRESSOR, HEATER, PermitLimits
 from thermostand.stand.config.stand_config import CompressorConfig
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import STOPPING
 from thermostand.stand.imaging.camera_supply import SupplyLimits
-from thermostand.stand.stand import Devices, Stand
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import STOPPING
 
 COMPRESSOR_LIMITS = CompressorConfig(start_above_cool_percent=20)
 

@@ -20,11 +20,11 @@ from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading, bad_reading
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK, OPERATOR
 from thermostand.stand.running.memory.entries import StepChanged as StepChanged
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.run_control import check_edit
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import INTERLOCK, OPERATOR
 from thermostand.stand.service.stand_service import ExtendRequest, PauseRequest, SkipRequest
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api_models import (

@@ -4,10 +4,10 @@ from typing import Protocol
 
 from tests.stand.small_stand import SmallStand
 from thermostand.foundation.readings import Frame
-from thermostand.stand.gate import Gate
+from thermostand.stand.assembly.stand import Stand
 from thermostand.stand.imaging.equilibrium import CameraEquilibrium
-from thermostand.stand.safety import Safety
-from thermostand.stand.stand import Stand
+from thermostand.stand.safety.gate import Gate
+from thermostand.stand.safety.making_safe import Safety
 
 
 class RunChamber(Protocol):

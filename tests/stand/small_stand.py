@@ -15,9 +15,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.markers.target import Target
-from thermostand.stand.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from thermostand.stand.assembly.stand import Stand
 from thermostand.stand.imaging.equilibrium import CameraEquilibrium
-from thermostand.stand.interlock import Interlocked
 from thermostand.stand.running.executing.camera_gap import OffsetWatch
 from thermostand.stand.running.executing.decisions import Decider, keep_fixed_plan
 from thermostand.stand.running.executing.executor import Executor, raise_unguarded
@@ -28,8 +27,9 @@ from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logb
 from thermostand.stand.running.opening.holds import keep_shut_in_holds
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.resume import merge_recorded
-from thermostand.stand.safety import Safety
-from thermostand.stand.stand import Stand
+from thermostand.stand.safety.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
+from thermostand.stand.safety.interlock import Interlocked
+from thermostand.stand.safety.making_safe import Safety
 
 TARGET = Target(name="paper-9x6", columns=9, rows=6, pitch_mm=30, diameter_mm=8)
 TIME_CONSTANT_S = 5.0  # of a camera that tells no temperature

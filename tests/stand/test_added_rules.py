@@ -15,10 +15,10 @@ from thermostand.foundation.events import GUARD, KINDS, Alert, make_alert
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.commands.remedies import get_next_command, make_troubleshooting_page
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
-from thermostand.stand.fault import Fault
+from thermostand.stand.safety.fault import Fault
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "room-rule"
 MODULE = (EXAMPLE / "acme_room.py").read_text(encoding="utf-8")

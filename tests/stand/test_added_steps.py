@@ -28,10 +28,10 @@ from thermostand.foundation.items import Event, StepMark
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.estimating.estimate import price_plan
-from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.running.memory.entries import Skipped, decode, encode, make_edit
 from thermostand.stand.running.memory.fold import find_refusal
 from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.safety.gate import INTERLOCK
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "lamp-step"
 MODULE = (EXAMPLE / "acme_lamp.py").read_text(encoding="utf-8")

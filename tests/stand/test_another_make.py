@@ -11,7 +11,7 @@ import yaml
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 CAMERA_FILE = '''
@@ -59,7 +59,7 @@ from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.stand_config import StandConfig
 for path in sys.argv[2:]:
     try:

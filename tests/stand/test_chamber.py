@@ -11,8 +11,8 @@ from thermostand.foundation.readings import Reading
 from thermostand.foundation.tasks import cancel_all
 from thermostand.stand.chamber.chamber import ChamberOrder
 from thermostand.stand.chamber.permits import HEATER
-from thermostand.stand.fault import Fault
-from thermostand.stand.interlock import Interlocked
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.interlock import Interlocked
 
 
 async def test_heat_is_permitted_after_the_set_point_and_before_the_regulator_runs():

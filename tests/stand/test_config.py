@@ -9,7 +9,7 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import load_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.safe_ranges import compute_largest_correction_K
 from thermostand.stand.config.stand_config import find_packaged, load_config

@@ -21,11 +21,11 @@ from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.commands.control_cli import format_status_lines
 from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.estimating.run_estimate import PlanEstimate
-from thermostand.stand.gate import Gate
-from thermostand.stand.latch import Latch
 from thermostand.stand.running.memory.state import RunState
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.status import StatusBoard
+from thermostand.stand.safety.gate import Gate
+from thermostand.stand.safety.latch import Latch
 from thermostand.stand.serving.api.access import get_user_name
 from thermostand.stand.serving.api_models import FaultState, NotConfirmed, RunStatus
 

@@ -13,7 +13,7 @@ from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.writing.disk import DiskProcess
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.service import systemd

@@ -20,7 +20,7 @@ from thermostand.recording.reading.notes import NOTES_NAME, add_tags
 from thermostand.recording.reading.run_status import Files
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.service.idle_log import IdleLog, remove_idle_logs
 

@@ -11,7 +11,7 @@ from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import load_document, parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.estimating.estimate import price_plan

@@ -16,9 +16,9 @@ from thermostand.stand.config.dew import DewConfig, compute_dew_point_degC
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.estimating.estimate import estimate_return_s, price_plan
 from thermostand.stand.estimating.learned_durations import LearnedDurations
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.rules import Announcements, make_watches
 from thermostand.stand.running.order import load_order
+from thermostand.stand.safety.fault import Fault
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.foundation.items import Batch, Event, Item, StepMark
 from thermostand.foundation.readings import Frame, Reading
-from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.running.executing.camera_gap import OffsetGap
+from thermostand.stand.safety.gate import INTERLOCK
 
 CAPTURE = Capture(20, 5.0, 0.1, Role.FIT, 24.0)
 PLAN = tuple(

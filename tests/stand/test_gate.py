@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.stand.gate import Gate, Phase, PhaseTurn, get_next_phase
+from thermostand.stand.safety.gate import Gate, Phase, PhaseTurn, get_next_phase
 
 REASONS = st.sampled_from(["operator", "interlock", "camera_lost", "disk_low"])
 

@@ -9,7 +9,7 @@ from tests.stand.guard_bench import Bench, NotedFile
 from thermostand.foundation.clock import VirtualClock, WallClock, block_until, to_ns
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading
-from thermostand.stand.fault import Fault
+from thermostand.stand.safety.fault import Fault
 
 
 async def test_a_guard_that_fails_aborts_and_makes_safe():

@@ -12,8 +12,8 @@ from tests.stand.guarded_failures import FAILURES, HARMLESS, PHASES, FailureRun,
 from tests.stand.guarded_recipes import RECIPES, Player
 from thermostand.foundation.documents import parse_document
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.rules import Announcements, make_watches
+from thermostand.stand.safety.fault import Fault
 
 CONFIG = load_config(find_packaged("", "simulated"))
 LIMIT_DEGC = CONFIG.guard.max_air_degC + 3.0

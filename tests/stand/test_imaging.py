@@ -10,10 +10,10 @@ from thermostand.drivers.devices.relays import CAMERA_POWER
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import StandTripped, Unreachable
 from thermostand.foundation.readings import Frame
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import CAMERA_LOST
 from thermostand.stand.imaging.camera_recovery import LOST_LIMIT_S
-from thermostand.stand.interlock import Interlocked
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import CAMERA_LOST
+from thermostand.stand.safety.interlock import Interlocked
 
 HELD, ON, OFF = (f"relays {CAMERA_POWER} {how}" for how in ("held", "on", "off"))
 

@@ -7,10 +7,10 @@ import pytest
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.errors import StandTripped
 from thermostand.foundation.hub import Hub
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING, Gate
-from thermostand.stand.interlock import Interlock, Interlocked, Motions
-from thermostand.stand.latch import Latch
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import INTERLOCK, OPERATOR, STOPPING, Gate
+from thermostand.stand.safety.interlock import Interlock, Interlocked, Motions
+from thermostand.stand.safety.latch import Latch
 
 
 class Counted:

@@ -7,7 +7,6 @@ from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Cause, Quality, Reading, bad_reading
-from thermostand.stand.fault import Fault, Rule, Watch
 from thermostand.stand.guarding.interlocks import (
     forbid_changed_settings,
     forbid_device_fault,
@@ -27,6 +26,7 @@ from thermostand.stand.guarding.interlocks import (
     require_regulator_running,
     require_session_folder,
 )
+from thermostand.stand.safety.fault import Fault, Rule, Watch
 
 PV, AIR = "regulator.pv", "thermometers.air"
 RUNNING, PERMIT = "regulator.running", "relays.heater_enable"

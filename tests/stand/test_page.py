@@ -14,7 +14,7 @@ from tests.stand.page_service import frame_of, free_port, serve_cycle, target_im
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, StepMark, StepState
 from thermostand.foundation.readings import Reading
-from thermostand.stand.gate import CAMERA_LOST
+from thermostand.stand.safety.gate import CAMERA_LOST
 from thermostand.stand.serving.api_models import HeatByHand, NotConfirmed
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]

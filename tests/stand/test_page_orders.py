@@ -11,7 +11,7 @@ from tests.stand.browser import DESKTOP, PHONE, VIEWS, a_page, needs_chromium
 from thermostand.foundation.documents import parse_document
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import find_packaged
-from thermostand.stand.gate import NOT_RECORDED, OPERATOR
+from thermostand.stand.safety.gate import NOT_RECORDED, OPERATOR
 from thermostand.stand.serving.api_models import NotConfirmed, QueuedRun
 
 pytestmark = [needs_chromium, pytest.mark.asyncio(loop_scope="module")]

@@ -15,7 +15,7 @@ import pytest_asyncio
 from tests.recording.full_session import make_half_second, record
 from tests.stand.page_service import TARGET, frame_of, free_port, serve_cycle, target_image
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
-from thermostand.stand.gate import REASON_TEXTS
+from thermostand.stand.safety.gate import REASON_TEXTS
 from thermostand.stand.serving.page_routes import PAGE
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")

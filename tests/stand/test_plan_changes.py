@@ -32,7 +32,6 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.readings import Frame
-from thermostand.stand.gate import OPERATOR
 from thermostand.stand.running.memory.entries import (
     Change,
     Edited,
@@ -44,6 +43,7 @@ from thermostand.stand.running.memory.entries import (
 )
 from thermostand.stand.running.memory.fold import find_refusal, fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
+from thermostand.stand.safety.gate import OPERATOR
 
 CAPTURE = Capture(4, 5.0, 0.1, Role.FIT, 24.0)
 PLAN = tuple(

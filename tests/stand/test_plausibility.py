@@ -13,7 +13,6 @@ from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.config.guard_section import HeaterOffConfig
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.plausibility import (
     FollowingBody,
     combine_surroundings,
@@ -22,6 +21,7 @@ from thermostand.stand.guarding.plausibility import (
 )
 from thermostand.stand.guarding.rules import Announcements, make_watches
 from thermostand.stand.guarding.stuck_sensor import forbid_stuck_while_other_moves
+from thermostand.stand.safety.fault import Fault
 
 
 def faults_of(night: ChamberRun) -> list[tuple[float, Fault]]:

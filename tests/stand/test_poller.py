@@ -11,7 +11,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
 from thermostand.foundation.repeat_limit import RepeatLimit
-from thermostand.stand.poller import Poller
+from thermostand.stand.assembly.poller import Poller
 
 
 class Slow:

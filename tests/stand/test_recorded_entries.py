@@ -16,8 +16,6 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.format.capture_restarts import make_restart_event
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK, OPERATOR, STOPPING
 from thermostand.stand.running.memory.entries import (
     Again,
     Begun,
@@ -34,6 +32,8 @@ from thermostand.stand.running.memory.entries import (
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
 from thermostand.stand.running.resume import Interruption, merge_recorded
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import INTERLOCK, OPERATOR, STOPPING
 
 BEGUN = Begun(1, "night-1", "0f", {})
 

@@ -15,9 +15,9 @@ from thermostand.foundation.events import GUARD, KINDS, Alert, EventKind, event,
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.repeat_limit import RepeatLimit
-from thermostand.stand import gate
 from thermostand.stand.commands.remedies import get_next_command, make_troubleshooting_page
 from thermostand.stand.commands.status_snapshot import format_event
+from thermostand.stand.safety import gate
 from thermostand.stand.serving.alerts import AlertTracker
 
 ROOT = Path(stand.__file__).parents[1]

@@ -11,9 +11,9 @@ from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.writing.notices import SpaceWatch
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import OPERATOR
 from thermostand.stand.guarding.rules import Announcements, make_channel_models, make_watches
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import OPERATOR
 
 
 class Table:

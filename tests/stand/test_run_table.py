@@ -24,7 +24,6 @@ from thermostand.experiments.steps import (
     number_steps,
 )
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.stand.gate import INTERLOCK, OPERATOR
 from thermostand.stand.running.executing.actions import (
     ArmCapture,
     Begin,
@@ -66,6 +65,7 @@ from thermostand.stand.running.memory.entries import (
 )
 from thermostand.stand.running.memory.fold import apply_entry, fold
 from thermostand.stand.running.memory.state import RunState, SetUp
+from thermostand.stand.safety.gate import INTERLOCK, OPERATOR
 
 S = NS_PER_S
 FIT = Capture(2, 10.0, 0.1, Role.FIT, 30.0)

@@ -9,7 +9,7 @@ from thermostand.foundation.errors import DeviceFault, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.safety import TRY_LIMIT_S, Pending, Safety
+from thermostand.stand.safety.making_safe import TRY_LIMIT_S, Pending, Safety
 
 
 class Actuator:

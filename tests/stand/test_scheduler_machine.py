@@ -30,12 +30,12 @@ from thermostand.foundation.errors import StandTripped
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.journal_lines import parse_lines
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K
 from thermostand.stand.running.memory.entries import Again, Soaked, StepChanged, decode
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.opening.stop import Interrupted
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import CAMERA_LOST, DISK_LOW, INTERLOCK, NOT_RECORDED, OPERATOR, STOPPING, Phase
 
 FRAMES = 4
 MEMORY = Path("/dev/shm")  # a journal on a busy disk takes most of the time

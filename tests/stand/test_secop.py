@@ -9,7 +9,7 @@ import pytest
 
 from tests.stand.secop_service import JAM, NO, WIRE, SecopService, node
 from tests.stand.secop_talk import talking
-from thermostand.stand.gate import INTERLOCK
+from thermostand.stand.safety.gate import INTERLOCK
 from thermostand.stand.serving.api_models import FaultState, HeatByHand
 from thermostand.stand.serving.secop import SecopRequest, make_message, parse_request
 

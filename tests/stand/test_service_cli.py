@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import find_packaged
-from thermostand.stand.latch import SYSTEM_FOLDER
+from thermostand.stand.safety.latch import SYSTEM_FOLDER
 from thermostand.stand.serving.instances import STANDS_FOLDER
 
 CONFIG = find_packaged("", "simulated")

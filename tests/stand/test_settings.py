@@ -23,7 +23,7 @@ from thermostand.drivers.wires.camera_settings import GigeCameraSettings
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import Document, parse_document
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 

@@ -13,7 +13,7 @@ from thermostand.experiments.steps import SoakUntilSettled, StartChamber, StopCh
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Reading
-from thermostand.stand.gate import INTERLOCK, OPERATOR
+from thermostand.stand.safety.gate import INTERLOCK, OPERATOR
 
 SOAK = SoakUntilSettled(1800.0, 60.0, 240.0, 60.0, 0.2, 0.003, 0.1, 24.0)
 PLAN = tuple(number_steps([StartChamber(24.0), SOAK, StopChamber()]))

@@ -12,7 +12,7 @@ from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.readings import Quality
-from thermostand.stand.table import check_home, prepare_axes
+from thermostand.stand.imaging.table import check_home, prepare_axes
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import yaml
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import SessionError
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
-from thermostand.stand.fault import Fault
-from thermostand.stand.latch import UNREADABLE, WITHIN_S, LatchFile, find_state_folder
 from thermostand.stand.running.opening.stand_lock import find_latch_file
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.latch import UNREADABLE, WITHIN_S, LatchFile, find_state_folder
 
 FAULT = Fault("over_temperature", "thermometers.air is 61.00 degC")
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.stand.memory_devices import run_memory_stand, trip
 from thermostand.foundation.errors import ConfigError, StandTripped, Unreachable
-from thermostand.stand.fault import Fault
+from thermostand.stand.safety.fault import Fault
 
 
 async def test_a_stage_without_its_scale_is_homed_first():

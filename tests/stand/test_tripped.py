@@ -22,17 +22,17 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import StandTripped, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
-from thermostand.stand import latch
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.commands import endpoint
 from thermostand.stand.commands.command_table import app as stand
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.fault import Fault, Readings, Watch
-from thermostand.stand.interlock import Interlocked
-from thermostand.stand.latch import UNREADABLE, find_state_folder
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stand_lock import find_latch_file
 from thermostand.stand.running.order import load_order
+from thermostand.stand.safety import latch
+from thermostand.stand.safety.fault import Fault, Readings, Watch
+from thermostand.stand.safety.interlock import Interlocked
+from thermostand.stand.safety.latch import UNREADABLE, find_state_folder
 from thermostand.stand.service.host import Host
 from thermostand.stand.service.run import run_real
 from thermostand.stand.service.stand_service import StandService

@@ -18,10 +18,10 @@ from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import load_document, parse_yaml
 from thermostand.foundation.errors import StandError
+from thermostand.stand.assembly.simulator import Simulator, describe_laboratory
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.order import Order
-from thermostand.stand.simulator import Simulator, describe_laboratory
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
 # Rendered and sent whole a frame costs as much as ten minutes of a night.

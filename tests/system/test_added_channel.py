@@ -27,8 +27,8 @@ from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.recorded_devices import recorded_devices
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import assemble
-from thermostand.stand.assembly import list_recorded_devices as declared_devices
+from thermostand.stand.assembly.assemble import assemble
+from thermostand.stand.assembly.assemble import list_recorded_devices as declared_devices
 from thermostand.stand.commands.sessions.session_text import format_info, make_info_json
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import Order

@@ -19,14 +19,14 @@ from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import assemble, list_device_kinds
+from thermostand.stand.assembly.assemble import assemble, list_device_kinds
+from thermostand.stand.assembly.simulator import Simulator, describe_laboratory, relocate
 from thermostand.stand.commissioning.commissioning import commission
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.opening.stand_lock import list_addresses
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.bench import list_devices, run_device_verb
 from thermostand.stand.service.run import run_virtual
-from thermostand.stand.simulator import Simulator, describe_laboratory, relocate
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "lamp"
 MODULE = (EXAMPLE / "acme_lamp.py").read_text(encoding="utf-8")

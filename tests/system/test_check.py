@@ -18,7 +18,8 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.documents import read_document
 from thermostand.foundation.errors import DeviceFault, InUse
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator
 from thermostand.stand.commands.check_cli import app
 from thermostand.stand.commissioning.commissioning import commission
 from thermostand.stand.config.check_record import explain_unchecked, load_check_record
@@ -27,7 +28,6 @@ from thermostand.stand.running.opening.open_stand import open_assembly
 from thermostand.stand.running.opening.stand_lock import lock_stand
 from thermostand.stand.running.opening.stop import Interrupted, Stop
 from thermostand.stand.running.order import Order, load_order, read_register_texts
-from thermostand.stand.simulator import ControlSocket, Simulator
 
 
 @pytest.fixture

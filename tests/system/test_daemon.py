@@ -26,7 +26,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.notes import read_notes
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.run import Run
 from thermostand.stand.service.daemon import Daemon

@@ -39,12 +39,12 @@ from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.estimating.learned_durations import LearnedDurations, load_learned_durations
-from thermostand.stand.fault import Fault
 from thermostand.stand.running.memory.entries import Ended, Held, Soaked, StepChanged, Tripped
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal
 from thermostand.stand.running.opening.stand_lock import find_latch_file
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.resume import load_interruption, make_begin_entry
+from thermostand.stand.safety.fault import Fault
 from thermostand.stand.service import queue
 from thermostand.stand.service.counters import StoredCounters, load_counters
 

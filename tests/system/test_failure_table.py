@@ -23,11 +23,11 @@ from thermostand.foundation.errors import ConfigError, DeviceError, DeviceFault,
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.readings import Quality, Reading
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.simulated_faults import break_or_mend, list_simulated_faults
 from thermostand.stand.serving.api_models import FaultRequest, Missing
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 PERIOD_S = 1.0
 OTHERS = ("regulator.pv", "thermometers.air", "relays.heater_enable", "linear.position", "flap.position")

@@ -20,14 +20,14 @@ from thermostand.foundation.clock import NS_PER_S, Clock, VirtualClock, WallCloc
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator
 from thermostand.stand.chamber.compressor import CompressorState, save_state
 from thermostand.stand.config.stand_config import CompressorConfig, StandConfig, find_packaged
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.rules import Announcements, make_watches
 from thermostand.stand.running.order import Order
+from thermostand.stand.safety.fault import Fault
 from thermostand.stand.service.run import run_virtual
-from thermostand.stand.simulator import ControlSocket, Simulator
 
 POLLED = AS_INSTALLED
 

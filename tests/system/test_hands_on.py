@@ -9,10 +9,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from tests.system.test_check import laboratory
+from thermostand.stand.assembly.simulator import Simulator
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.order import Order
-from thermostand.stand.simulator import Simulator
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from tests.system.test_guard_wire import Bench, bench_of
 from thermostand import stand
 from thermostand.drivers.sim.laboratory_faults import FAULTS
 from thermostand.foundation.clock import NS_PER_S
+from thermostand.stand.assembly.simulator import Simulator
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.order import Order
-from thermostand.stand.simulator import Simulator
 
 POLLED = AS_INSTALLED
 

@@ -24,11 +24,11 @@ from thermostand.foundation.events import CLOCK_STEP
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory
 from thermostand.stand.commands.sessions.session_commands import app
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_real
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory
 
 MOVED = Path(__file__).parent / "moved_clocks"
 COLD = """

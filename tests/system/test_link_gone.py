@@ -131,7 +131,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     """A minute, here a tenth of a second."""
     ordered = order(SOAK, **FAST | {"bus": QUICK})
     await asyncio.to_thread(simulator, ordered.config, False)
-    monkeypatch.setattr("thermostand.stand.safety._GIVEN_UP_AFTER_S", 0.1)
+    monkeypatch.setattr("thermostand.stand.safety.making_safe._GIVEN_UP_AFTER_S", 0.1)
     monkeypatch.setattr("thermostand.stand.service.daemon._LOOK_S", 0.2)
     text = (tmp_path / "config.yaml").read_text()
     texts = {"config.yaml": text, "target.yaml": find_packaged("targets", ordered.config.target).read_text()}

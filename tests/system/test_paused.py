@@ -10,7 +10,7 @@ from tests.daemon_queries import ask
 from tests.system.test_guard_run import LONG_SOAK, Watcher, run_operated
 from tests.system.test_guard_wire import Start, bench_of
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import Assembly
+from thermostand.stand.assembly.assemble import Assembly
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.opening.stop import Stop

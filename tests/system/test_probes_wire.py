@@ -10,10 +10,10 @@ from tests.stand.guarded_recipes import RECIPES
 from tests.system.conftest import AS_INSTALLED, CORNER, WHOLE_SENSOR
 from tests.system.test_guard_wire import Bench, bench_of
 from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly.simulator import Simulator
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
-from thermostand.stand.simulator import Simulator
 
 POLLED = AS_INSTALLED
 

@@ -19,6 +19,7 @@ from thermostand.foundation.errors import SessionError, Unreachable
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Item, StepMark
 from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly.simulator import ControlSocket
 from thermostand.stand.commands.live import RunFollower
 from thermostand.stand.commands.status_snapshot import StatusSnapshot
 from thermostand.stand.config.interface_section import InterfaceConfig
@@ -26,7 +27,6 @@ from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import Interrupted, run_real
 from thermostand.stand.serving.client import API, make_server
 from thermostand.stand.serving.interface import make_interface
-from thermostand.stand.simulator import ControlSocket
 
 BRIEF = """
 name: brief

@@ -11,7 +11,7 @@ from tests.system.test_guard_wire import Bench, Start, bench_of, write_by_anothe
 from thermostand.foundation.clock import to_ns
 from thermostand.foundation.errors import DeviceFault, Unreachable
 from thermostand.foundation.hub import Hub
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
 from thermostand.stand.imaging.camera_recovery import CameraRecovery
 from thermostand.stand.running.order import Order
 

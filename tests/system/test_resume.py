@@ -25,12 +25,12 @@ from thermostand.recording.format.messages import FRAME_META_CLASS
 from thermostand.recording.reading.run_status import Files, RunOutcome
 from thermostand.recording.reading.scan import scan, verify
 from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly.simulator import ControlSocket
 from thermostand.stand.running.memory.entries import Gap, Soaked, StepChanged
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import Interruption, load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
-from thermostand.stand.simulator import ControlSocket
 
 NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
 ONE_SET_POINT = NIGHT.replace("[30, 20, 24]", "[30]").replace("[20]", "[]")

@@ -23,9 +23,9 @@ from thermostand.foundation.errors import ConfigError, SessionError, StandError,
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly.simulator import ControlSocket
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import Interrupted, run_virtual
-from thermostand.stand.simulator import ControlSocket
 
 
 def digests(session: Path) -> dict[str, str]:

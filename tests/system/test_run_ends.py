@@ -27,11 +27,11 @@ from thermostand.foundation.errors import NotReset, StandTripped
 from thermostand.foundation.events import AlertCause
 from thermostand.foundation.items import Event, Item, StepMark, StepState
 from thermostand.recording.reading.session import Session
+from thermostand.stand.assembly.simulator import Simulator
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import Interrupted, run_real, run_virtual
 from thermostand.stand.serving.alerts import AlertMessage, AlertTracker
-from thermostand.stand.simulator import Simulator
 
 SHORTER = SHORT_RECIPE.replace("600", "60").replace("[30, 20, 24]", "[26]").replace("held_out_degC: [20]", "")
 

@@ -14,9 +14,9 @@ from thermostand.drivers.sim.gige.gvsp_sender import Switch
 from thermostand.foundation.clock import WallClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Frame
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
+from thermostand.stand.assembly.simulator import Simulator, describe_laboratory, relocate
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.simulator import Simulator, describe_laboratory, relocate
 
 
 def test_what_a_switch_cannot_hold_is_lost():

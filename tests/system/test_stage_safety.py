@@ -20,13 +20,13 @@ from thermostand.drivers.wires.registers import load_register_map
 from thermostand.foundation.clock import Clock, WallClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Refused, Superseded
 from thermostand.foundation.hub import Hub
+from thermostand.stand.assembly.stand import Devices, Stand
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import CompressorConfig, find_packaged
-from thermostand.stand.fault import Fault
 from thermostand.stand.imaging.camera_supply import SupplyLimits
-from thermostand.stand.interlock import Interlocked
-from thermostand.stand.stand import Devices, Stand
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.interlock import Interlocked
 
 from .flap_bench import SETTINGS as FLAP
 from .stage_bench import SERIAL_NUMBER, Bench, running_bench

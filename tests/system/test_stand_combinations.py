@@ -22,14 +22,14 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.recording.reading.scan import verify
 from thermostand.recording.reading.session import Session
-from thermostand.stand.assembly import assemble
+from thermostand.stand.assembly.assemble import assemble
+from thermostand.stand.assembly.simulator import describe_laboratory
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 from thermostand.stand.estimating.missing_devices import list_missing_devices
 from thermostand.stand.running.order import Order, check_plan
 from thermostand.stand.service.bench import list_devices
 from thermostand.stand.service.run import run_virtual
-from thermostand.stand.simulator import describe_laboratory
 
 Data = dict[str, Any]
 SIMULATED: Data = yaml.safe_load(find_packaged("", "simulated").read_text())

@@ -17,8 +17,8 @@ from thermostand.foundation.items import Batch, Event, Item
 from thermostand.foundation.tasks import cancel_all
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
-from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.running.order import Order
+from thermostand.stand.safety.gate import INTERLOCK
 from thermostand.stand.service.run import run_virtual
 
 RECIPE = """

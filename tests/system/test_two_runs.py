@@ -18,10 +18,10 @@ from tests.stand.test_listening import connected
 from tests.system.conftest import FAST, require_aravis
 from tests.system.test_real_time import BRIEF
 from thermostand.foundation.errors import SessionError
+from thermostand.stand.assembly.simulator import ControlSocket
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.order import Order
 from thermostand.stand.serving.client import list_running_sessions
-from thermostand.stand.simulator import ControlSocket
 
 LIMIT_S = 90.0  # for a busy machine
 LONG = BRIEF.replace("equilibrium_s: 0.5", "equilibrium_s: 3600").replace("[26]", "[40]")

@@ -22,11 +22,11 @@ from thermostand.foundation.errors import StandError, StandTripped
 from thermostand.recording.reading.session import Session
 from thermostand.recording.repair.salvage import salvage_session
 from thermostand.recording.writing.disk import MODULE
+from thermostand.stand.assembly.simulator import ControlSocket
 from thermostand.stand.running.opening.writer_restarts import MOST_PER_H
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import run_real
-from thermostand.stand.simulator import ControlSocket
 
 SOAK = """
 name: soak

@@ -18,11 +18,11 @@ from tests.sections import change
 from thermostand.foundation.clock import VirtualClock, to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event, Item
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
+from thermostand.stand.assembly.simulator import ControlSocket, Simulator, describe_laboratory, relocate
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.opening.open_stand import OpenStand, open_assembly
 from thermostand.stand.running.opening.stop import Stop
-from thermostand.stand.simulator import ControlSocket, Simulator, describe_laboratory, relocate
 
 
 @dataclass

@@ -27,8 +27,8 @@ from tests.torture.lives import HIDDEN, find_folder
 from tests.torture.operator_actions import OperatorActions
 from thermostand.foundation.clock import NS_PER_S, VirtualClock, to_ns
 from thermostand.recording.writing import notices
+from thermostand.stand.assembly.simulator import Simulator
 from thermostand.stand.serving.client import Server, find_session_server
-from thermostand.stand.simulator import Simulator
 
 LOOK_EVERY_S, LOOKS = 300.0, 200  # at what HTTP says
 _TASKS = ("TaskStepMethWrapper", "TaskWakeupMethWrapper", "builtin_function_or_method")

@@ -56,9 +56,9 @@ from thermostand.foundation.addresses import parse_tcp_address
 from thermostand.foundation.clock import NS_PER_S, WallClock, to_ns
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.writing.disk import MODULE
+from thermostand.stand.assembly.simulator import describe_laboratory
 from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.serving.client import Server, find_session_server
-from thermostand.stand.simulator import describe_laboratory
 
 BUSY_S = 40.0  # in which things break
 AFTER_S = 7.0

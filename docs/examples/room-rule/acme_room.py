@@ -6,7 +6,7 @@ from pydantic import Field
 
 from thermostand.foundation.documents import Document
 from thermostand.stand.config.guard_rule_plugins import GuardRule
-from thermostand.stand.fault import Fault, Readings, Watch, get_value
+from thermostand.stand.safety.fault import Fault, Readings, Watch, get_value
 
 
 class Settings(Document):

@@ -35,7 +35,7 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.tasks import cancel_all, wait_for_first
 from thermostand.recording.format.capture_restarts import make_restart_event
-from thermostand.stand.interlock import Interlocked
+from thermostand.stand.assembly.stand import Stand
 from thermostand.stand.running.executing.actions import (
     Action,
     ArmCapture,
@@ -81,7 +81,7 @@ from thermostand.stand.running.memory.entries import (
 from thermostand.stand.running.memory.fold import apply_entry, describe_change, find_refusal
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.memory.state import Plan, RunState, SetUp
-from thermostand.stand.stand import Stand
+from thermostand.stand.safety.interlock import Interlocked
 
 # Brings about again what the steps so far have set up, after something has undone it.
 

@@ -18,7 +18,8 @@ from thermostand.foundation.items import Batch, Item
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.foundation.workers import WorkerThread
 from thermostand.markers.target import Target
-from thermostand.stand.estimating.chamber_model import BAND_K
+from thermostand.stand.assembly.stand import Stand
+from thermostand.stand.config.chamber_section import BAND_K
 from thermostand.stand.imaging.settling import (
     Float,
     SettlingData,
@@ -27,7 +28,6 @@ from thermostand.stand.imaging.settling import (
     measure_movement,
     to_seconds,
 )
-from thermostand.stand.stand import Stand
 
 if TYPE_CHECKING:
     from thermostand.markers.detection import Detection

@@ -11,11 +11,11 @@ from thermostand.foundation.errors import DeviceFault
 from thermostand.foundation.events import FRAME_UNSETTLED, SOAK_LONGER, SOAK_UNSETTLED
 from thermostand.foundation.readings import UNSETTLED
 from thermostand.foundation.tasks import wait_for_first
-from thermostand.stand.gate import Gate
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
 from thermostand.stand.running.memory.entries import Soaked
 from thermostand.stand.running.memory.journal import Logbook
 from thermostand.stand.running.memory.state import RunState, get_duration_ns
+from thermostand.stand.safety.gate import Gate
 
 _JOURNAL_NS = 60 * NS_PER_S  # of a soak that a kill costs at most
 

@@ -21,7 +21,6 @@ from thermostand.experiments.steps import (
     number_steps,
 )
 from thermostand.foundation.clock import to_ns
-from thermostand.stand.gate import INTERLOCK
 from thermostand.stand.running.memory.entries import (
     Again,
     Change,
@@ -43,6 +42,7 @@ from thermostand.stand.running.memory.entries import (
     Tripped,
 )
 from thermostand.stand.running.memory.state import RunState, SetUp
+from thermostand.stand.safety.gate import INTERLOCK
 
 
 def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:

@@ -35,11 +35,11 @@ from thermostand.recording.format.layout import TELEMETRY
 from thermostand.recording.writing.disk import JOURNAL_LINE, DiskProcess
 from thermostand.recording.writing.folder_watch import FolderLost
 from thermostand.recording.writing.locks import lock
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import HELD, INTERLOCK, REASON_TEXTS, RELEASED, STOPPING
 from thermostand.stand.running.memory.entries import Ended, Entry, Held, JournalEntry, Reset, Tripped, decode, encode
 from thermostand.stand.running.memory.fold import apply_entry
 from thermostand.stand.running.memory.state import RunState
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import HELD, INTERLOCK, REASON_TEXTS, RELEASED, STOPPING
 
 _END_WITHIN_S, _COMPLETE_WITHIN_S = 1.0, 10.0  # real seconds that a disk may take for the last entry
 _DAMAGED = ".damaged"  # the ending of the copy of a journal with damaged lines

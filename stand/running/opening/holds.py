@@ -12,9 +12,9 @@ from thermostand.foundation.events import COMMAND, FLAP_NOT_SHUT, FLAP_SHUT_IN_H
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event, Item
 from thermostand.foundation.tasks import wait_for_first
-from thermostand.stand.gate import STOPPING, Gate
-from thermostand.stand.latch import Latch
-from thermostand.stand.stand import Stand
+from thermostand.stand.assembly.stand import Stand
+from thermostand.stand.safety.gate import STOPPING, Gate
+from thermostand.stand.safety.latch import Latch
 
 # Within 60 s of the hold it is shut, its travel included; a shorter pause leaves a capture as it is.
 SHUT_AFTER_S = 48.0

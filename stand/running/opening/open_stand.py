@@ -19,17 +19,17 @@ from thermostand.foundation.repeat_limit import RepeatLimit
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.foundation.tasks import cancel_all, run_with_background
 from thermostand.recording.writing.disk import FILES_LINE, LATCH_LINE, DiskProcess
-from thermostand.stand.assembly import Assembly, assemble
+from thermostand.stand.assembly.assemble import Assembly, assemble
+from thermostand.stand.assembly.poller import Poller
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import CAMERA_LOST, DISK_LOW, NOT_RECORDED, OPERATOR, STOPPING
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import Recording
 from thermostand.stand.guarding.rules import Announcements
-from thermostand.stand.poller import Poller
 from thermostand.stand.running.opening.holds import keep_shut_in_holds
 from thermostand.stand.running.opening.stand_lock import find_latch_file, lock_stand
 from thermostand.stand.running.opening.stop import Stop
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import CAMERA_LOST, DISK_LOW, NOT_RECORDED, OPERATOR, STOPPING
 
 _OPENING_SAFE_LIMIT_S = 60.0  # for what was opened before something else failed; nothing has been permitted yet
 

@@ -28,7 +28,7 @@ from thermostand.foundation.addresses import SerialEndpoint, parse_address
 from thermostand.foundation.errors import InUse, SessionError
 from thermostand.foundation.lock_file import release_lock, take_lock, try_lock
 from thermostand.stand.config.stand_config import StandConfig
-from thermostand.stand.latch import LatchFile
+from thermostand.stand.safety.latch import LatchFile
 from thermostand.stand.serving.instances import (
     STANDS_FOLDER,
     find_lock_folder,

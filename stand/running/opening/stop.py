@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from thermostand.foundation.errors import Interrupted, SessionError, StandTripped
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import STOPPING, Gate, Phase, PhaseTurn, get_next_phase
-from thermostand.stand.stand import Stand
+from thermostand.stand.assembly.stand import Stand
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import STOPPING, Gate, Phase, PhaseTurn, get_next_phase
 
 STOPPED_BY_OPERATOR = "operator"  # the rule of a fault that is no fault
 STOPPED = Fault(STOPPED_BY_OPERATOR, "stopped by the operator")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.stand.fault import Fault
 from thermostand.stand.guarding.interlocks import RECORDING_ENDED
+from thermostand.stand.safety.fault import Fault
 
 # Round number; nothing was measured.
 MOST_PER_H = 3

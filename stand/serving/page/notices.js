@@ -3,7 +3,7 @@ import { called, order } from "./api.js";
 import { temperatures, look_of } from "./channels.js";
 import { clock, day_clock, fill, h, number, say, seconds, unit_of, words } from "./dom.js";
 
-// What holds a run (stand/gate.py), and what ends that by itself.
+// What holds a run (stand/safety/gate.py), and what ends that by itself.
 const REASON = {
   operator: "paused by an operator", interlock: "a fault has tripped", camera_lost: "a camera does not answer",
   disk_low: "the disk takes no frames", not_recorded: "the disk takes no telemetry", stopping: "the run is being ended",
@@ -159,7 +159,7 @@ function chamber_of({ heater_permitted, setpoint_degC, readings }) {
   return "Heat and cold are permitted; the regulator's set-point is not known now.";
 }
 
-// The safe state of each part that there is (stand/safety.py): each has confirmed it.
+// The safe state of each part that there is (stand/safety/making_safe.py): each has confirmed it.
 function confirmed({ flap, axes }) {
   const stages = Object.keys(axes).map(words);
   const parts = ["heat and cold are off", flap === "none" ? "" : "the flap is closed", stages.length ? `the stages (${stages.join(", ")}) stand still` : ""];

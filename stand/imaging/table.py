@@ -15,7 +15,7 @@ from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.events import HOME_RESIDUAL, HOME_RESIDUAL_LARGE, HOMED, RE_APPROACHED
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.readings import Quality
-from thermostand.stand.interlock import Interlock, Motions
+from thermostand.stand.safety.interlock import Interlock, Motions
 
 # A stepper that slips loses whole electrical periods of four full steps; what is less than half of one is the switch.
 HOME_RESIDUAL_LIMIT_STEPS = 2.0

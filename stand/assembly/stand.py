@@ -17,14 +17,14 @@ from thermostand.foundation.clock import Clock
 from thermostand.foundation.events import PROMPT, PROMPT_SKIPPED
 from thermostand.foundation.hub import Hub
 from thermostand.stand.chamber.chamber import Chamber, ChamberLimits
-from thermostand.stand.gate import OPERATOR, Gate
 from thermostand.stand.imaging.camera_supply import CameraSupply, SupplyLimits
 from thermostand.stand.imaging.cameras import Cameras
 from thermostand.stand.imaging.imaging import Imaging
-from thermostand.stand.interlock import Interlock, Motions
-from thermostand.stand.latch import Latch
-from thermostand.stand.safety import Safety
-from thermostand.stand.table import Table
+from thermostand.stand.imaging.table import Table
+from thermostand.stand.safety.gate import OPERATOR, Gate
+from thermostand.stand.safety.interlock import Interlock, Motions
+from thermostand.stand.safety.latch import Latch
+from thermostand.stand.safety.making_safe import Safety
 
 _JAMMED_AGAIN_S = 60.0  # between tries to close a flap that jams: its motor must not be worn
 

@@ -25,8 +25,8 @@ from thermostand.foundation.events import LATCH_NOT_KEPT, LATCH_NOT_RESET
 from thermostand.foundation.files import replace_file, sync_folder
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.sealed import seal, unseal
-from thermostand.stand.fault import Fault
-from thermostand.stand.gate import INTERLOCK, Gate
+from thermostand.stand.safety.fault import Fault
+from thermostand.stand.safety.gate import INTERLOCK, Gate
 
 SYSTEM_FOLDER = Path("/var/lib/thermostand")
 UNREADABLE = "latch_unreadable"

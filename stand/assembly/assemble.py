@@ -19,10 +19,11 @@ from thermostand.foundation.document_faults import nearest
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.hub import Hub
 from thermostand.recording.format.batches import RecordedDevice
+from thermostand.stand.assembly.poller import Poller
+from thermostand.stand.assembly.stand import Devices, Stand
 from thermostand.stand.chamber.chamber import ChamberLimits
 from thermostand.stand.chamber.permits import PermitLimits
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
-from thermostand.stand.fault import Fault, Watch
 from thermostand.stand.guarding.channel_check import ChannelCheck
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import (
@@ -40,8 +41,7 @@ from thermostand.stand.guarding.rules import (
 )
 from thermostand.stand.guarding.step_errors import StepErrors
 from thermostand.stand.imaging.camera_supply import SupplyLimits
-from thermostand.stand.poller import Poller
-from thermostand.stand.stand import Devices, Stand
+from thermostand.stand.safety.fault import Fault, Watch
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from thermostand.foundation.errors import StandTripped
-from thermostand.stand.gate import STOPPING, Gate
-from thermostand.stand.latch import Latch
+from thermostand.stand.safety.gate import STOPPING, Gate
+from thermostand.stand.safety.latch import Latch
 
 
 class Interlocked(StandTripped):
