@@ -29,7 +29,7 @@ from thermostand.stand.config.check_record import ATTACHMENT, load_check_record
 from thermostand.stand.config.interface_section import TokenFile, load_tokens
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.order import read_optics_texts
-from thermostand.stand.service.serve import serve as serve_stand
+from thermostand.stand.service.daemon import serve as serve_stand
 from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.access import TokenStore
 from thermostand.stand.serving.interface import HERE, make_interface, serve_interface

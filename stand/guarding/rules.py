@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from thermostand.experiments.steps import Capture
-from thermostand.foundation.events import FRAMES_RESUMED, FRAMES_STOPPED
+from thermostand.foundation.clock import NS_PER_S, to_ns
+from thermostand.foundation.events import CONNECTED, FRAMES_RESUMED, FRAMES_STOPPED, guard_rule
 from thermostand.foundation.items import Event, Item, StepMark, StepState
+from thermostand.stand.config.chamber_section import StartupResponseConfig
 from thermostand.stand.config.dew import compute_dew_point_degC
 from thermostand.stand.config.guard_rule_plugins import load_rule
+from thermostand.stand.config.guard_section import ChannelLimits
 from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.guarding.channel_check import LEAST_LAG_S, ChannelModel
-from thermostand.stand.guarding.channel_limits import limit_watches
-from thermostand.stand.guarding.heat_balance import limit_heat_energy, require_heat_response
+from thermostand.stand.guarding.heat_balance import compute_heat_percent, limit_heat_energy, require_heat_response
 from thermostand.stand.guarding.interlocks import (
     Recording,
     forbid_changed_settings,
@@ -41,17 +44,141 @@ from thermostand.stand.guarding.plausibility import (
     WarmAround,
     combine_surroundings,
     forbid_warming_while_off,
+    make_stateful_rule,
     read_channels,
     require_cooling_response,
 )
 from thermostand.stand.guarding.sensor_diagnosis import SensorHistory, name_suspect
 from thermostand.stand.guarding.sensor_drift import limit_sensor_drift
-from thermostand.stand.guarding.startup_response import require_startup_response
 from thermostand.stand.guarding.steady_state_power import limit_output_deviation
 from thermostand.stand.guarding.stuck_sensor import forbid_stuck_sensor, forbid_stuck_while_other_moves
 from thermostand.stand.guarding.thermal_crosscheck import crosscheck_by_camera, crosscheck_by_granite
-from thermostand.stand.safety.fault import DONE, Readings, Rule, Watch, get_value
+from thermostand.stand.safety.fault import DONE, Fault, Readings, Rule, Watch, get_value
 from thermostand.stand.safety.gate import HELD, OPERATOR, RELEASED
+
+# The first heat of a daemon: do the regulator's probe, its heater and the chamber's air belong together?
+
+FIRST_HEAT = guard_rule("first_heat", "the temperature does not rise where the first heat is given")
+_HEATS_PERCENT = 40.0  # that no chamber can take without getting warmer
+_LACKING_K = 1.0  # below its set-point by more than this the regulator heats, nearer it only holds
+
+
+@dataclass(frozen=True, slots=True)
+class StartupState:
+    """Heating since `since_ns`, from what `shown_degC` (PV, air) were; the most that each has risen. is_passed: both
+    have risen, and nothing is looked at any more."""
+
+    since_ns: int
+    shown_degC: tuple[float, float]
+    risen_K: tuple[float, float] = (0.0, 0.0)
+    sum_percent: float = 0.0
+    count: int = 0
+    is_passed: bool = False
+
+
+def require_startup_response(limits: StartupResponseConfig, air: str, regulator: str, permit: str) -> Rule:
+    """The regulator heats for the first time, and its value or the chamber's air does not rise: two identical
+    regulators with exchanged addresses pass every other probe."""
+    pv = f"{regulator}.pv"
+
+    def begins(readings: Readings) -> bool:
+        lacking_K = get_value(readings, f"{regulator}.sp") - get_value(readings, pv)
+        return lacking_K > _LACKING_K and compute_heat_percent(readings, regulator, permit) >= _HEATS_PERCENT
+
+    def step(last: StartupState | None, readings: Readings, now_ns: int) -> tuple[StartupState | None, Fault | None]:
+        if last is not None and last.is_passed:
+            return last, None
+        shown_degC = get_value(readings, pv), get_value(readings, air)
+        if math.isnan(sum(shown_degC)):
+            return None, None
+        if last is None:
+            return (StartupState(now_ns, shown_degC) if begins(readings) else None), None
+        return _judged(
+            _update_state(last, shown_degC, compute_heat_percent(readings, regulator, permit)), readings, now_ns
+        )
+
+    def _judged(state: StartupState, readings: Readings, now_ns: int) -> tuple[StartupState | None, Fault | None]:
+        if min(state.risen_K) >= limits.rise_K:
+            return replace(state, is_passed=True), None
+        if now_ns - state.since_ns < to_ns(limits.within_s):
+            return state, None
+        if state.sum_percent / state.count < _HEATS_PERCENT:
+            return None, None  # too little heat to judge
+        rises = " and ".join(
+            f"{name} rose by {risen_K:.1f} K" for name, risen_K in zip((pv, air), state.risen_K, strict=True)
+        )
+        text = f"in the first {limits.within_s:g} s of heat {rises}; both should rise by {limits.rise_K:g} K"
+        return None, Fault(FIRST_HEAT, f"{text}: is this regulator the one of this chamber?")
+
+    return make_stateful_rule(step)
+
+
+def _update_state(state: StartupState, shown_degC: tuple[float, float], percent: float) -> StartupState:
+    risen_K = tuple(
+        max(most_K, shown - begun)
+        for most_K, shown, begun in zip(state.risen_K, shown_degC, state.shown_degC, strict=True)
+    )
+    return replace(
+        state, risen_K=(risen_K[0], risen_K[1]), sum_percent=state.sum_percent + percent, count=state.count + 1
+    )
+
+
+# Limits of one's own for what any device of the stand measures (`guard.channels`).
+
+CHANNEL_LIMIT = guard_rule(
+    "channel_limit",
+    "a channel is outside the limits that `guard.channels` sets for it",
+    "see to what it measures; its limits are in the stand's file below `guard.channels`",
+)
+CHANNEL_SILENT = guard_rule("channel_silent", "a channel with limits in `guard.channels` has no reading", CONNECTED)
+
+
+def limit_watches(limited: Mapping[str, ChannelLimits]) -> Iterator[Watch]:
+    """What is looked at for the limits of these channels. Without a reading nobody knows whether a limit is kept: that
+    waits for an operator, but it does not end a run."""
+    for channel, limits in limited.items():
+        yield Watch(_outside(channel, limits), limits.after_s, DONE[limits.action])
+        yield Watch(
+            _silent(channel, limits.after_s),
+            action="warn" if limits.action == "warn" else "hold",
+            after_gap_s=limits.after_s,
+        )
+
+
+def _outside(channel: str, limits: ChannelLimits) -> Rule:
+    """The last value of `channel` is outside its limits. One that has no value is the matter of `_silent`."""
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        reading = readings.known(channel)
+        if reading is None:
+            return None
+        unit = "" if reading.unit in ("", "1") else f" {reading.unit}"
+        shown = f"{channel} is {reading.value:.6g}{unit}"
+        if limits.lowest is not None and reading.value < limits.lowest:
+            return Fault(CHANNEL_LIMIT, f"{shown}, below its limit of {limits.lowest:g}{unit}")
+        if limits.highest is not None and reading.value > limits.highest:
+            return Fault(CHANNEL_LIMIT, f"{shown}, above its limit of {limits.highest:g}{unit}")
+        return None
+
+    return rule
+
+
+def _silent(channel: str, after_s: float) -> Rule:
+    """`channel` has had no measurement for longer than `after_s`, since the guard began to look at the earliest."""
+    begun_ns: int | None = None
+
+    def rule(readings: Readings, now_ns: int) -> Fault | None:
+        nonlocal begun_ns
+        begun_ns = now_ns if begun_ns is None else begun_ns
+        good_ns, latest = readings.last_good_ns(channel), readings.latest(channel)
+        silent_ns = now_ns - max(begun_ns, good_ns or 0)
+        if silent_ns <= to_ns(after_s):
+            return None
+        why = "it has never been read" if latest is None else latest.reason or "it is not read any more"
+        return Fault(CHANNEL_SILENT, f"{channel} has no reading for {silent_ns / NS_PER_S:.0f} s: {why}")
+
+    return rule
+
 
 PV, AIR, GRANITE, LABORATORY = (
     "regulator.pv",

@@ -40,8 +40,8 @@ from thermostand.drivers.sim.gige.genicam_file import GenicamFile, read_genicam
 from thermostand.drivers.sim.gige.gvcp import Ack, GvcpRequest, GvcpStatus, Nack
 from thermostand.drivers.wires import camera_connection
 from thermostand.drivers.wires.aravis import GigeDevice
+from thermostand.drivers.wires.camera_connection import NoTemperature, find_temperature
 from thermostand.drivers.wires.camera_settings import GigeCameraSettings, TemperatureFeature
-from thermostand.drivers.wires.camera_temperature import NoTemperature, find_temperature
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.errors import ConfigError, Refused
 from thermostand.foundation.readings import Quality

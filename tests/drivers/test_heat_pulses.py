@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.drivers.devices.regulators.heat_pulses import HeatPulses, PulsesSettings, compute_pulse_s
+from thermostand.drivers.devices.regulators.software_regulator import HeatPulses, PulsesSettings, compute_pulse_s
 from thermostand.foundation.clock import FollowedClock, to_ns
 from thermostand.foundation.errors import DeviceFault, Refused
 from thermostand.foundation.readings import Reading

@@ -8,7 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermostand.drivers.sim.units.pid import OFF, Gains, Outputs, Side, on_time_ns, outputs_of, resume, start, step
+from thermostand.drivers.sim.units.regulator import (
+    OFF,
+    Gains,
+    Outputs,
+    Side,
+    on_time_ns,
+    outputs_of,
+    resume,
+    start,
+    step,
+)
 
 SIDE = Side(band_K=3.0, integral_s=180.0, derivative_s=20.0)
 GAINS = Gains(heat=SIDE, cool=SIDE)

@@ -18,8 +18,8 @@ from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.service import systemd
 from thermostand.stand.service.counters import Counters, CountersFile, StoredCounters, load_counters
+from thermostand.stand.service.daemon import ReportQueue
 from thermostand.stand.service.run_queue import RunQueue
-from thermostand.stand.service.serve import ReportQueue
 from thermostand.stand.serving.api_models import Conflict, RunRequest, Who
 
 

@@ -17,8 +17,8 @@ from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Event
 from thermostand.foundation.readings import Reading
 from thermostand.foundation.tasks import cancel_all
+from thermostand.stand.chamber.chamber import PermitRenewer
 from thermostand.stand.chamber.compressor import CompressorState
-from thermostand.stand.chamber.permit_renewer import PermitRenewer
 from thermostand.stand.chamber.permits import COMPRESSOR, HEATER, Permission, PermitLimits, Permits
 from thermostand.stand.config.stand_config import CompressorConfig
 

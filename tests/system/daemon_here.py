@@ -11,8 +11,7 @@ from tests.system.test_daemon import LIMIT_S
 from thermostand.foundation.clock import WallClock
 from thermostand.foundation.hub import Hub
 from thermostand.stand.config.stand_config import find_packaged, load_config
-from thermostand.stand.service.daemon import Daemon
-from thermostand.stand.service.serve import serve
+from thermostand.stand.service.daemon import Daemon, serve
 from thermostand.stand.service.stand_service import StandService
 
 

@@ -30,7 +30,7 @@ from thermostand.stand.assembly.assemble import assemble
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.run import Run
 from thermostand.stand.service.daemon import Daemon
-from thermostand.stand.service.serve import serve as serve_stand
+from thermostand.stand.service.daemon import serve as serve_stand
 from thermostand.stand.service.stand_service import DeviceRequest, StandService, SubmitRequest
 from thermostand.stand.serving.api_models import Conflict, StandState, Who
 from thermostand.stand.serving.client import Server, find_session_server

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from thermostand.stand.chamber.permit_renewer import SUPERVISION_PERIOD_S
+from thermostand.stand.chamber.chamber import SUPERVISION_PERIOD_S
 from thermostand.stand.config.guard_section import GuardConfig
 from thermostand.stand.guarding.guard import LATE_PERIODS
 

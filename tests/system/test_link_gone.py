@@ -25,9 +25,8 @@ from thermostand.foundation.items import Event
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.running.order import Order
-from thermostand.stand.service.daemon import Daemon
+from thermostand.stand.service.daemon import Daemon, serve
 from thermostand.stand.service.run import Interrupted, run_virtual
-from thermostand.stand.service.serve import serve
 from thermostand.stand.service.stand_service import StandService, SubmitRequest
 from thermostand.stand.serving.api_models import Who
 

@@ -23,9 +23,8 @@ from thermostand.foundation.sealed import seal
 from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
-from thermostand.stand.running.opening.resume_config import make_resume_config
 from thermostand.stand.running.order import Order, load_order
-from thermostand.stand.running.resume import load_interruption
+from thermostand.stand.running.resume import load_interruption, make_resume_config
 from thermostand.stand.service import queue
 from thermostand.stand.service.queue_file import QUEUE_NAME, start_working
 from thermostand.stand.service.run import Interrupted, resume, run_real, run_virtual
