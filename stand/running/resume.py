@@ -3,7 +3,7 @@
 The journal says what was done, the recording what it produced: a step whose end is recorded is done, and a frame
 counts when its image and its description are both on the disk. What only the recording proves is put between the
 journal's entries, and all of them are folded into the state from which the run is resumed. Recipe, seed and target are
-those of the session, not today's files; the stand is this one (stand.running.opening.resume_config).
+those of the session, not today's files; the stand is this one (see the settings that are kept below).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     async def skip(self, who: Who, given: SkipRequest) -> str:
         "Leave a step out, or break it off."
 
-From it follow the route and its OpenAPI (api/order_routes.py), the verb of the command line (commands/verbs.py), the
+From it follow the route and its OpenAPI (api/app.py), the verb of the command line (commands/verbs.py), the
 command that is recorded (`perform`), SECoP's command of the module `run`, and the page's button (`GET
 /api/v1/commands`).
 """
