@@ -1,8 +1,7 @@
 """Watches the rules, and waits for nothing but the time: no disk, no bus, no client.
 
-Each look judges the latest readings. While all is well it allows the permits to be renewed
-(the PermitRenewer of stand/chamber does that); when a rule objects it latches the stand and demands that it is made safe
-(stand.safety does that).
+Each look judges the latest readings. While all is well it allows the permits to be renewed (chamber.PermitRenewer does
+that); when a rule objects it latches the stand and demands that it is made safe (safety.making_safe does that).
 """
 
 from __future__ import annotations
