@@ -36,7 +36,7 @@ test: setup
 
 nightly: setup
 	@sh .ci/system-packages $(PEER_PACKAGES) spin
-	$(BIN)/pytest -m "nightly or hypothesis" --hypothesis-profile=night -o faulthandler_timeout=5400
+	$(BIN)/pytest -m "nightly or hypothesis" --hypothesis-profile=nightly -o faulthandler_timeout=5400
 	$(BIN)/python -m tests.torture --minutes 30 --jobs $(shell nproc) --shrink 40
 	$(BIN)/python -m tests.torture --real --minutes 10 --jobs $(shell nproc)
 

@@ -100,7 +100,7 @@ _PREVIEW_WIDTH_PX = 816  # a third of a 5 MP frame, which is enough on a page
 class SessionFacts:
     """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
     segments that a killed recorder left behind and that were not read. utc: from its instants to UTC. spots: what a
-    thermal imager saw of the camera, name -> (time_ns, degC). doubtful: frames that the noise model does not describe,
+    thermal imager saw of the camera, name -> (time_ns, degC). suspect: frames that the noise model does not describe,
     so that the covariance of their centres is an estimate (markers.Detection). uid: of the session alone."""
 
     session_id: str
@@ -115,7 +115,7 @@ class SessionFacts:
         default_factory=dict[str, tuple[NDArray[np.int64], Float]], compare=False
     )
     uid: str = ""
-    doubtful: int = 0
+    suspect: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -303,7 +303,7 @@ def _build_observations(session: Session, target: Target, found: FoundMarkers, f
     image = session.frame(int(own[first])).image
     return Observations(
         target=target,
-        sessions=(_collect_facts(session, int(np.count_nonzero(found.doubtful))),),
+        sessions=(_collect_facts(session, int(np.count_nonzero(found.suspect))),),
         image_size=(image.shape[1], image.shape[0]),
         preview=_make_preview(image),
         session=np.zeros(len(reasons), np.int64),
@@ -351,7 +351,7 @@ def _check_purpose(role: str, chamber_degC: float) -> tuple[str, float]:
     return role, chamber_degC
 
 
-def _collect_facts(session: Session, doubtful: int) -> SessionFacts:
+def _collect_facts(session: Session, suspect: int) -> SessionFacts:
     fields = ("session_id", "recipe", "operator", "software_version")
     texts = {name: session.metadata.get(name, "") for name in fields} | {"camera_serial": read_serial(session)}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
@@ -361,7 +361,7 @@ def _collect_facts(session: Session, doubtful: int) -> SessionFacts:
         incomplete=len(session.incomplete),
         utc=session.utc,
         spots=_read_spots(session),
-        doubtful=doubtful,
+        suspect=suspect,
         uid=session.metadata.get("uid", ""),
     )
 
@@ -416,13 +416,13 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 def _disambiguate_ids(parts: Sequence[Observations]) -> list[Observations]:
     """Sessions of one second and recipe have the same id: behind the first one's it says which they are."""
     known: dict[str, str] = {}
-    told: list[Observations] = []
+    named: list[Observations] = []
     for part in parts:
         (facts, *others) = part.sessions
         if known.setdefault(facts.session_id, facts.uid) != facts.uid:
             facts = replace(facts, session_id=f"{facts.session_id} ({facts.uid})")
-        told.append(replace(part, sessions=(facts, *others)))
-    return told
+        named.append(replace(part, sessions=(facts, *others)))
+    return named
 
 
 def _check_same(first: Observations, other: Observations) -> None:

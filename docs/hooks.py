@@ -220,8 +220,8 @@ def _commands(command: Any, name: str) -> Iterator[str]:
 
 def _help(text: str) -> str:
     """Its paragraphs; the last line, `Example: ...`, as code."""
-    said, _, example = text.replace("\b", "").partition("Example: ")
-    return _paragraphs(said) + (f"\n\n```console\n{example.strip()}\n```" if example else "")
+    summary, _, example = text.replace("\b", "").partition("Example: ")
+    return _paragraphs(summary) + (f"\n\n```console\n{example.strip()}\n```" if example else "")
 
 
 def _parameter(each: Any, context: Any) -> str:
@@ -242,8 +242,8 @@ def routes() -> str:
     lines = ["| method | path | what it does | takes |", "|---|---|---|---|"]
     for path, methods in document["paths"].items():
         for method, route in methods.items():
-            said = route.get("summary", "") if "description" not in route else route["description"]
-            first = said.strip().split("\n\n")[0]
+            summary = route.get("summary", "") if "description" not in route else route["description"]
+            first = summary.strip().split("\n\n")[0]
             body = route.get("requestBody", {}).get("content", {}).get("application/json", {}).get("schema", {})
             taken = [f"`{each['name']}`" for each in route.get("parameters", []) if each["in"] == "query"]
             taken += [f"`{name}`" for name in _fields(body, document)]

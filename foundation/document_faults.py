@@ -160,8 +160,8 @@ def describe_fault(fault: ErrorDetails, written: str | None = None) -> str:
         return ours
     if kind == "string_pattern_mismatch" and (text := _PATTERNS.get(fault.get("ctx", {}).get("pattern", ""), "")):
         return text
-    said = fault["msg"].removeprefix("Value error, ")
-    text = re.sub(r"^(Input|String|Value|Tuple|List|Dictionary) should ", "must ", said)
+    message = fault["msg"].removeprefix("Value error, ")
+    text = re.sub(r"^(Input|String|Value|Tuple|List|Dictionary) should ", "must ", message)
     if kind == "literal_error" and isinstance(fault["input"], str):
         text += nearest(fault["input"], re.findall(r"'([^']*)'", text))
     return text

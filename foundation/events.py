@@ -206,10 +206,10 @@ RESET_ADVICE = "`stand reset` once the cause is removed"
 CONNECTED = "`stand devices` shows what is connected"
 SENSOR = "compare it with another thermometer at its place, and look at its cable"
 CAMERA_ENDS = f"it continues when the camera answers: {CONNECTED}"
-DISK_SPACE_ADVICE = "it continues when there is room: `stand session archive` copies what is finished elsewhere"
-DISK = "it continues when the disk takes what waits: see that it is there, has room and answers"
+DISK_SPACE_ADVICE = "it continues when there is space: `stand session archive` copies what is finished elsewhere"
+DISK = "it continues when the disk takes what waits: see that it is mounted, has space and answers"
 _BY_ITSELF = "it continues by itself when that is over"
-_SEE_DISK = "see that the disk has room and answers"
+_SEE_DISK = "see that the disk has space and answers"
 _NOT_ON = "look at the relay board, its supply and that channel: `stand check` tries each relay"
 _SWITCHED = "find what else switches it: a key of the unit, a second program on its line"
 _RESET_FOLDER = "have its disk mounted, or the folder moved back, then `stand reset`"
@@ -263,10 +263,10 @@ GUARD_LATE = event("guard_late", "warning",
     "the guard has not looked for {gap_s:.1f} s: the daemon was stopped, suspended or held up",
     "see what stopped or loads this computer; " + _SLEEP)
 SENSOR_BELIEVED = event("sensor_believed", "info",
-    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {doubted_s:.0f} s under suspicion: {text}",
+    "{channels[0]} is believed again, at {value_degC:.2f} degC, after {suspect_s:.0f} s under suspicion: {text}",
     is_limited=True)
 LATCH_NOT_KEPT = event("latch_not_kept", "error", "that the stand has tripped may be forgotten at a restart: {text}",
-    "see that the folder of the stand's state is there and has room")
+    "see that the folder of the stand's state exists and has space")
 LATCH_NOT_RESET = event("latch_not_reset", "warning", "at a restart the stand is taken for tripped: {text}",
     "`stand reset` again, when the disk answers")
 LIMITS_OVERRIDDEN = event("limits_overridden", "warning", "{text}",

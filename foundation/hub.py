@@ -42,7 +42,7 @@ class Hub:
                 self._latest[reading.channel] = reading
                 if reading.cause != "wire":
                     self._known[reading.channel] = reading
-                if reading.quality is Quality.GOOD or reading.cause == "doubt":
+                if reading.quality is Quality.GOOD or reading.cause == "suspect":
                     self._good_ns[reading.channel] = reading.time_ns
         if self._limit is not None and isinstance(item, Event):
             admitted = self._limit.admit(item)

@@ -21,9 +21,9 @@ class Quality(StrEnum):
 
 # Why a reading is BAD: "wire", the poll failed or its reply was garbled, and the device may be all right; "device", the
 # device itself says that it has no measurement (sensor break, converter error, out of range); "" when that is unknown.
-# Why one is STALE: "alarm", the device is in an alarm of its own; "doubt", it was measured, but its value is not to be
-# believed (jumped, noisy, stuck); "" otherwise.
-Cause = Literal["", "wire", "device", "alarm", "doubt"]
+# Why one is STALE: "alarm", the device is in an alarm of its own; "suspect", it was measured, but its value is not to
+# be believed (jumped, noisy, stuck); "" otherwise.
+Cause = Literal["", "wire", "device", "alarm", "suspect"]
 
 
 class Channel(NamedTuple):
@@ -64,7 +64,7 @@ def bad_reading(channel: str, unit: str, time_ns: int, reason: str, cause: Cause
     return Reading(channel, math.nan, unit, time_ns, Quality.BAD, reason, cause=cause)
 
 
-TEMPERATURE_SUSPECT = "temperature_in_doubt"
+TEMPERATURE_SUSPECT = "temperature_suspect"
 """The flag of a frame whose camera temperature is not to be believed."""
 UNSETTLED = "unsettled"
 """The flag of a frame before which the chamber was not in its band at the end of the soak."""

@@ -1,4 +1,4 @@
-"""How often what repeats is published: what somebody reads at night must not be buried under one sentence.
+"""How often what repeats is published: what an operator reads must not be buried under one sentence.
 
 Three limits, by what the event's row says. A sentence: three at once, then one each 20 min. A state that begins and
 ends, such as a device that is lost and is back: the third time within an hour its end is withheld until it has lasted

@@ -57,10 +57,10 @@ from thermostand.markers.target import Target
 WIDE_SIGMA, NARROW_SIGMA = 9.0, 4.5
 """Half widths of the band in blurs."""
 WIDE_EXCESS = (WIDE_SIGMA / NARROW_SIGMA) ** 2
-# With a limit of 1.4 alone 0.6 % of clean frames were doubtful, but only 56 % of those with JPEG of quality 90.
+# With a limit of 1.4 alone 0.6 % of clean frames were suspect, but only 56 % of those with JPEG of quality 90.
 _GROWTH_LIMIT, _SUSPECT_GROWTH_LIMIT = 1.4, 1.3
 """Along x or y alone, as rows that flicker have it."""
-# With it 1 of 200 frames of noise alone is doubtful, 47 of 48 of JPEG 90 and of JPEG 80, and all of gamma, rows and
+# With it 1 of 200 frames of noise alone is suspect, 47 of 48 of JPEG 90 and of JPEG 80, and all of gamma, rows and
 # grain (`python -m tests.bench claimed_variances`). Half of it is 1.4 sigma from noise, and twice above most of JPEG
 # 90.
 _CORRELATION_LIMIT, _SUSPECT_CORRELATION_LIMIT = 0.35, 0.3
@@ -91,7 +91,7 @@ class ResidualCorrelation:
         return self.along > _GROWTH_LIMIT - 1 or self.together > limit or self.levels > _LEVELS_LIMIT
 
     def is_suspect(self) -> bool:
-        """Whether it may be doubtful, if this is from a sample of the markers: then it takes all to decide."""
+        """Whether it may be suspect, if this is from a sample of the markers: then it takes all to decide."""
         return (
             self.along > _SUSPECT_GROWTH_LIMIT - 1
             or self.together > _SUSPECT_CORRELATION_LIMIT
@@ -346,7 +346,7 @@ class Detection:
     homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame. growth: (2,), by what the
     variances along x and y exceed, or fall below, those of residuals that are independent of each other (sandwich.py).
     excess_px2: (2,), what misfit of ground and disc adds to them, px^2. band_sigma: half width of the band of pixels
-    fitted, in blurs (below). The next frame keeps these two. is_doubtful: the noise model does not describe the
+    fitted, in blurs (below). The next frame keeps these two. is_suspect: the noise model does not describe the
     picture (compression, texture, print, flicker): the covariance is an estimate from how its residuals hang together.
     is_orientation_assumed: nothing says which way up the target is (Target.orientation): half a turn looks the same.
     """
@@ -360,7 +360,7 @@ class Detection:
     growth: Float
     excess_px2: Float
     band_sigma: float
-    is_doubtful: bool
+    is_suspect: bool
     is_orientation_assumed: bool = False
 
     @property
@@ -433,7 +433,7 @@ def _follow(picture: Picture, target: Target, previous: Detection, noise: Noise 
         raise ValueError(f"the previous detection has {len(previous.flags)} markers, the target {target.count}")
     if not is_still_in_place(picture, previous.state, np.isfinite(previous.chi), _get_reach(target)[:, :1]):
         return None
-    sampled = target.count if previous.is_doubtful else SAMPLED_MARKERS
+    sampled = target.count if previous.is_suspect else SAMPLED_MARKERS
     with suppress(DetectionError):
         tracked = _fit_in_band(picture, target, previous.state, noise, previous.band_sigma, sampled)
         if tracked is not None and has_followed(tracked[0].centres_px, previous.centres_px):
@@ -455,7 +455,7 @@ def make_empty_detection(target: Target) -> Detection:
         growth=np.ones(2),
         excess_px2=np.zeros(2),
         band_sigma=WIDE_SIGMA,
-        is_doubtful=False,
+        is_suspect=False,
     )
 
 
@@ -523,7 +523,7 @@ def _fit(picture: Picture, target: Target, start: EdgeState, noise: Noise | None
     if found is None:
         return None
     wide, fit = found
-    if not wide.is_doubtful:
+    if not wide.is_suspect:
         return wide
     again = _fit_in_band(picture, target, wide.state, noise, NARROW_SIGMA, target.count)
     if again is None:
@@ -568,8 +568,8 @@ def _add_excess(detection: Detection, excess: Float) -> Detection:
     hang together over the whole marker hide from `growth`: below 1 it is not believed."""
     growth = np.where(excess > 0, np.maximum(detection.growth, 1), detection.growth)
     covariance = _grow_variances(detection.covariance_px2, growth / detection.growth) + np.diag(excess)
-    doubtful = detection.is_doubtful or bool(np.any(excess > 0))
-    return replace(detection, covariance_px2=covariance, growth=growth, excess_px2=excess, is_doubtful=doubtful)
+    suspect = detection.is_suspect or bool(np.any(excess > 0))
+    return replace(detection, covariance_px2=covariance, growth=growth, excess_px2=excess, is_suspect=suspect)
 
 
 def _assess(
@@ -604,7 +604,7 @@ def _assess(
         growth=strange.growth,
         excess_px2=np.zeros(2),
         band_sigma=band_sigma,
-        is_doubtful=strange.exceeds_noise_model(),
+        is_suspect=strange.exceeds_noise_model(),
     )
     return found, strange
 

@@ -26,7 +26,7 @@ CENTRES = "x_px, y_px: centres of the outlines in the image; disc_x_px, disc_y_p
 
 
 def format_noise_warning(images: int) -> str:
-    """Return the warning about so many images whose detections are doubtful."""
+    """Return the warning about so many images whose detections are suspect."""
     return (
         f"noise alone does not describe {images} image{'s' * (images != 1)} (texture, print, compression, flicker): "
         "the variances of their centres are estimates from how the residuals hang together, perhaps too small by half"

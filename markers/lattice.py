@@ -106,9 +106,9 @@ def _predict_step(
             step = step + _CURVATURE * (step - (points[cells[before]] - points[cells[twice]]))
         return step
     for side in ((dj, di), (-dj, -di)):
-        here, there = (i + side[0], j + side[1]), (i + side[0] + di, j + side[1] + dj)
-        if here in cells and there in cells:
-            return points[cells[there]] - points[cells[here]]
+        here, neighbour = (i + side[0], j + side[1]), (i + side[0] + di, j + side[1] + dj)
+        if here in cells and neighbour in cells:
+            return points[cells[neighbour]] - points[cells[here]]
     return base[0] * di + base[1] * dj
 
 

@@ -104,8 +104,8 @@ def make_picture(image: Image, rows: Mask | None = None) -> Picture:
     low_first = np.ascontiguousarray(image, image.dtype.newbyteorder("<"))
     view = low_first.view(np.uint8).reshape(*image.shape, image.itemsize)
     view.flags.writeable = False
-    is_there = np.ones(len(image), np.bool_) if rows is None else rows
-    return Picture(view, find_full_scale_DN(image), is_there, np.zeros(1, np.bool_))
+    has_row = np.ones(len(image), np.bool_) if rows is None else rows
+    return Picture(view, find_full_scale_DN(image), has_row, np.zeros(1, np.bool_))
 
 
 def allocate_pixels(capacity: int) -> Pixels:
@@ -123,7 +123,7 @@ def gather(image: Picture, ellipse: Float, scale: float, limits: Limits, ceiling
     """
     samples, rows, missed, centre, shape = image.samples, image.rows, image.missed, ellipse[:2], ellipse[2:5]
     height, width, size = samples.shape
-    room, table = pixels.table.shape[2], pixels.table.reshape(pixels.table.size)
+    most, table = pixels.table.shape[2], pixels.table.reshape(pixels.table.size)
     count = pixels.counts
     count[:] = 0
     seen, cut, flat = 0, False, samples.reshape(samples.size)
@@ -146,9 +146,9 @@ def gather(image: Picture, ellipse: Float, scale: float, limits: Limits, ceiling
             if count[region] + end - begin + _AT_ONCE > pixels.table.shape[2]:
                 return Gathered(-1, -1, cut)
             seen += end - begin
-            first, slot = (row * width + begin) * size, region * _ROWS * room + count[region]
+            first, slot = (row * width + begin) * size, region * _ROWS * most + count[region]
             x, y = begin - pixels.origin[0], row - pixels.origin[1]
-            _copy_run(flat, Run(first, size, end - begin, x, y), table, slot, room)
+            _copy_run(flat, Run(first, size, end - begin, x, y), table, slot, most)
             count[region] += end - begin
     burnt = 0
     for region in range(3):
@@ -172,7 +172,7 @@ def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, li
 
 
 @compile_part
-def _copy_run(flat: Bytes, run: Run, table: Single, slot: int, room: int) -> None:
+def _copy_run(flat: Bytes, run: Run, table: Single, slot: int, most: int) -> None:
     """Write the pixels of a run of the image's bytes into the table from `slot` on, and up to 7 more behind them.
 
     Both are one long row: slices of tables would be counted as in use, and released, for every run.
@@ -180,7 +180,7 @@ def _copy_run(flat: Bytes, run: Run, table: Single, slot: int, room: int) -> Non
     first, size = run.first, run.size
     whole = (run.length + _AT_ONCE - 1) // _AT_ONCE * _AT_ONCE
     count = np.uint64(min(whole, (len(flat) - first) // size))  # unsigned: not looked at for being negative
-    u, v, values = np.uint64(slot + U * room), np.uint64(slot + V * room), np.uint64(slot + VALUE * room)
+    u, v, values = np.uint64(slot + U * most), np.uint64(slot + V * most), np.uint64(slot + VALUE * most)
     byte, column, row = np.uint64(first), np.float32(run.x), np.float32(run.y)
     for k in range(count):
         table[u + k] = column + np.float32(np.int32(k))

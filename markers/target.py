@@ -162,10 +162,12 @@ class Target(Document):
             return f"orientation: by the odd marker {self.odd_marker.number}"
         if self.donut_markers is not None:
             return "orientation: by the donut markers {}, {} and {}".format(*self.donut_markers.numbers)
-        said = "assumed, for the target file does not say" if self.is_orientation_assumed else "as the target file says"
+        stated = (
+            "assumed, for the target file does not say" if self.is_orientation_assumed else "as the target file says"
+        )
         return (
             f"orientation: {self.name} looks the same after half a turn; its rows are taken to point within 75 deg of "
-            f"{self.nominal_roll_deg:g} deg in the image ({said}: nominal_roll_deg)"
+            f"{self.nominal_roll_deg:g} deg in the image ({stated}: nominal_roll_deg)"
         )
 
     @property

@@ -22,7 +22,7 @@ from thermostand.recording.writing import notices
 
 # How long an example takes says how busy the machine is.
 settings.register_profile("day", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("night", settings.get_profile("day"), max_examples=500)
+settings.register_profile("nightly", settings.get_profile("day"), max_examples=500)
 settings.load_profile("day")
 
 # GVCP's port and the one address the stock camera takes are fixed: only one worker may have it.
@@ -36,7 +36,7 @@ _LONG_FILES = {
     "tests/drivers/test_climate_chamber_losses.py",
     "tests/stand/test_page.py",
     "tests/stand/test_page_orders.py",
-    "tests/stand/test_page_room.py",
+    "tests/stand/test_page_routes.py",
 }
 _TOGETHER = {
     # Real devices belong to one program by their serial numbers, whatever their addresses.

@@ -171,9 +171,9 @@ def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, ou
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: Float32, room: _Buffers) -> None:
+def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: Float32, buffers: _Buffers) -> None:
     """BLOCK_px rows of the source, in a strip, at the places that the result asks for."""
-    whole, weights, row, cells = room.whole, room.weights, room.row, strip.cells
+    whole, weights, row, cells = buffers.whole, buffers.weights, buffers.row, strip.cells
     height, last = image.shape[0], from_x.shape[0] - 1
     upper, lower = from_x[min(max(band, 0), last)], from_x[min(max(band + 1, 0), last)]
     _weigh(upper, lower, strip, table, whole, weights)
@@ -192,7 +192,7 @@ def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: F
         begin = 0
         while begin < cells:
             end = _find_run_end(whole, begin, cells)
-            run, line = _Cells(begin, end - begin), room.held[y % _HELD_ROWS]
+            run, line = _Cells(begin, end - begin), buffers.held[y % _HELD_ROWS]
             _filter_along_x(row, whole[begin] - low, weights, np.float32(down), run, line)
             begin = end
 

@@ -67,7 +67,7 @@ def build_runtime_model(model: DriftModel) -> dict[str, object]:
 def _compute_residual_px(model: DriftModel) -> Float:
     """(2,), px: in sessions that were not fitted, as those are in which a running camera asks."""
     match model:
-        case ThermalModel(between_nights=BetweenSessions(sigma_px=between_px)):
+        case ThermalModel(between_sessions=BetweenSessions(sigma_px=between_px)):
             return np.hypot(model.discrepancy_px, between_px)
         case _:
             return model.discrepancy_px

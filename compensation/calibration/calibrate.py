@@ -185,7 +185,7 @@ class CameraCalibration:
     rays_times: float = 1.0
 
     @property
-    def rays_doubt(self) -> str:
+    def rays_warning(self) -> str:
         """Why the ray model is not to be used; "" when it describes the lens."""
         if self.rays_times <= _MOST_TIMES:
             return ""

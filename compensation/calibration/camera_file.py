@@ -149,7 +149,7 @@ class UncertaintyPart(Document):
 class CameraFile(Document):
     """A calibrated camera. names, vector: fx fy cx cy (px) and the distortion; covariance: of the vector, then a step
     of the table (c mm, l, a, R0 rad, o mm). scores: none when they are not known; not_known: which checks, and why.
-    rays_doubt: why there are no rays, or why not to use them; "" when they describe the lens."""
+    rays_warning: why there are no rays, or why not to use them; "" when they describe the lens."""
 
     format: Literal["thermostand camera"] = FORMAT
     schema_version: Literal[1] = 1
@@ -169,7 +169,7 @@ class CameraFile(Document):
     scores: tuple[ScorePart, ...]
     uncertainty: UncertaintyPart
     not_known: tuple[str, ...] = ()
-    rays_doubt: str = ""
+    rays_warning: str = ""
 
     @model_validator(mode="after")
     def _check_consistent(self) -> CameraFile:
@@ -227,7 +227,7 @@ class CameraFile(Document):
     def ray_lens(self) -> RayLens:
         """The ray model; CalibrationError when the file has none."""
         if (part := self.rays) is None:
-            raise CalibrationError(f"the camera file has no ray model: {self.rays_doubt or 'it was left out'}")
+            raise CalibrationError(f"the camera file has no ray model: {self.rays_warning or 'it was left out'}")
         coefficients, covariance = np.array(part.coefficients_mm), np.array(part.covariance_mm2)
         return RayLens(part.degree, coefficients, covariance, part.range_mm, np.array(part.hull_px), self.lens)
 
@@ -275,8 +275,8 @@ def build_camera_file(
         "fit": _describe_fit(calibration),
         "table": _describe_table(calibration.adjustment),
         "board": calibration.adjustment.adjusted_board,
-        "rays": None if calibration.rays_doubt and not keep_rays else _describe_rays(calibration.rays),
-        "rays_doubt": calibration.rays_doubt,
+        "rays": None if calibration.rays_warning and not keep_rays else _describe_rays(calibration.rays),
+        "rays_warning": calibration.rays_warning,
         "scores": calibration.scores,
         "uncertainty": _describe_uncertainty(calibration),
         "not_known": calibration.not_known,

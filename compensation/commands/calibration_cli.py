@@ -115,8 +115,8 @@ def format_summary(file: CameraFile, target: Target) -> str:
         lines.append(f"the halves differ by {1e3 * apart_px:z.2f} mpx RMS at {file.uncertainty.distance_mm:z.0f} mm")
     lines += file.not_known
     lines += _format_projection(file)
-    if file.rays_doubt:
-        lines.append(f"{file.rays_doubt}{'' if file.rays else '. It is not written; --keep-rays writes it'}")
+    if file.rays_warning:
+        lines.append(f"{file.rays_warning}{'' if file.rays else '. It is not written; --keep-rays writes it'}")
     refit = refit_radtan(file.lens)
     lines.append(
         f"Kalibr's model without k3 differs by {1e3 * refit.rms_px:z.2f} mpx RMS, {1e3 * refit.worst_px:z.1f} at most"

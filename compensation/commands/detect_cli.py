@@ -57,12 +57,12 @@ def detect_images(
         opened = [_open(path, incomplete) for path in sources]
         chosen = _select_target(opened, target)
         failures: list[str] = []
-        doubtful: list[str] = []
+        suspect: list[str] = []
         with report_marker_search(sum(_count(source) for source in opened), is_quick=True) as report:
-            write_detections(out, chosen, _detect_all(opened, chosen, failures, doubtful, report))
-        shown = {"table": out, "target": chosen.name, "not_found": failures, "doubtful": doubtful}
+            write_detections(out, chosen, _detect_all(opened, chosen, failures, suspect, report))
+        shown = {"table": out, "target": chosen.name, "not_found": failures, "suspect": suspect}
         show(shown, [CENTRES, chosen.orientation])
-        say_left_out("not found in", failures, doubtful)
+        say_left_out("not found in", failures, suspect)
 
 
 def _open(path: Path, incomplete: bool) -> Session | Path:
@@ -89,10 +89,10 @@ def _count(source: Session | Path) -> int:
 
 
 def _detect_all(
-    sources: Sequence[Session | Path], target: Target, failures: list[str], doubtful: list[str], report: Report
+    sources: Sequence[Session | Path], target: Target, failures: list[str], suspect: list[str], report: Report
 ) -> Iterator[DetectedImage]:
     """Every image in turn; where the target is not found all its markers are missing, and `failures` grows by a line;
-    `doubtful` by the names of those that noise does not describe.
+    `suspect` by the names of those that noise does not describe.
 
     DetectionError when it is found nowhere.
     """
@@ -109,8 +109,8 @@ def _detect_all(
             except DetectionError as error:
                 failures.append(f"{name}: {error}")
                 found = make_empty_detection(target)
-            if found.is_doubtful:
-                doubtful.append(name)
+            if found.is_suspect:
+                suspect.append(name)
             report(images, name)
             yield DetectedImage(name, time_ns, found)
     if len(failures) == images:

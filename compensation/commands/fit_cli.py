@@ -187,13 +187,13 @@ def fit(
     data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
     stepped = [_format_bump(each, observations) for each in bumps]
     stepped += [f"{one.session_id}: {one.text}" for one in named]
-    repeats = model.between_nights if isinstance(model, ThermalModel) else None
+    repeats = model.between_sessions if isinstance(model, ThermalModel) else None
     stepped += [] if repeats is None else [repeats.text]
     scored = f"what it gains is not known: {unscored}" if evaluation is None else format_table(evaluation)
     scores = {"not_scored": unscored} if evaluation is None else _describe_scores(evaluation)
     left_out = [f"{count} frames are left out: {reason}" for reason, count in observations.left_out.items()]
     lines = [f"{model.form}: {model.title}", *left_out, *stepped, scored]
-    show({**data, "left_out": observations.left_out, "unrepeated": named, "between_nights": repeats, **scores}, lines)
+    show({**data, "left_out": observations.left_out, "unrepeated": named, "between_sessions": repeats, **scores}, lines)
 
 
 @app.command()

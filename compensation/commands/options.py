@@ -63,8 +63,8 @@ class MarkerSearch:
         """The markers of the sessions. Raises as `observe`, and ConfigError for a target that is neither a file nor
         installed."""
         wanted, found_by = load_optional_target(self.target), finder(self.workers, self.cluster, use_cache=self.cache)
-        said = make_warning_sink(self.incomplete)
-        return observe(sessions, progress, wanted, found_by, across_gap=self.across_gap, incomplete=said, camera=camera)
+        warn = make_warning_sink(self.incomplete)
+        return observe(sessions, progress, wanted, found_by, across_gap=self.across_gap, incomplete=warn, camera=camera)
 
 
 def open_session(path: Path, camera: str | None, incomplete: bool) -> Session:
@@ -108,9 +108,9 @@ def report_marker_search(count: int, *, is_quick: bool = False) -> Generator[Rep
         yield report
 
 
-def say_left_out(what: str, failures: Sequence[str], doubtful: Sequence[str]) -> None:
+def say_left_out(what: str, failures: Sequence[str], suspect: Sequence[str]) -> None:
     """Messages about images that were not used, and those that noise does not describe."""
     for failure in failures:
         say(f"{what} {failure}")
-    if doubtful:
-        say(format_noise_warning(len(doubtful)))
+    if suspect:
+        say(format_noise_warning(len(suspect)))

@@ -76,19 +76,19 @@ def calibrate_rig_command(
         board = load_board(target)
         names = _list_picture_names(folders)
         failures: list[str] = []
-        doubtful: list[str] = []
+        suspect: list[str] = []
         with report_marker_search(len(folders) * len(names)) as report:
             seen = [
                 collect_views(
                     _list_pictures(folder, names),
                     board,
                     failures,
-                    doubtful,
+                    suspect,
                     _offset_progress(report, number * len(names)),
                 )
                 for number, folder in enumerate(folders)
             ]
-        say_left_out("not used:", failures, doubtful)
+        say_left_out("not used:", failures, suspect)
         useful = np.any([views.seen.any(axis=1) for views in seen], axis=0)
         found = calibrate_rig([views.select(useful) for views in seen], make_prior_board(board))
         lines = [
@@ -97,7 +97,7 @@ def calibrate_rig_command(
             board.orientation,
         ]
         data = _write_calibration(found, folders, export)
-        show({"cameras": data, "not_used": failures, "doubtful": doubtful, "exports": export}, lines)
+        show({"cameras": data, "not_used": failures, "suspect": suspect, "exports": export}, lines)
 
 
 def _list_picture_names(folders: list[Path]) -> list[str]:
@@ -208,10 +208,10 @@ def calibrate_photographs(
         check_folder_writable(export, EXPORTS)
         board = load_board(target)
         failures: list[str] = []
-        doubtful: list[str] = []
+        suspect: list[str] = []
         with report_marker_search(len(images)) as report:
-            seen = collect_views([(path, path.name) for path in images], board, failures, doubtful, report)
-        say_left_out("not used:", failures, doubtful)
+            seen = collect_views([(path, path.name) for path in images], board, failures, suspect, report)
+        say_left_out("not used:", failures, suspect)
         views, given = seen.select(np.asarray(seen.seen.any(axis=1))), make_prior_board(board)
         found = calibrate_views(views, given)
         at_mm = distance_mm or float(np.mean(found.scene.translations_mm[:, 2]))
@@ -223,7 +223,7 @@ def calibrate_photographs(
         lens = dict(zip(NAMES, found.scene.lens.vector, strict=False))
         data = {"lens": lens, "lens_sigma": found.lens_sigma, "rms_px": found.rms_px, "projection": projection}
         checked = {"held_out_px": held_out_px, "held_out_not_known": unknown}
-        more = {"discrepancy_px": found.discrepancy_px, "not_used": failures, "doubtful": doubtful, "exports": export}
+        more = {"discrepancy_px": found.discrepancy_px, "not_used": failures, "suspect": suspect, "exports": export}
         write_exports(export, found.scene.lens, "camera", found.rms_px)
         show({**data, **checked, **more}, lines)
 
@@ -274,11 +274,11 @@ def collect_views(
     pictures: Sequence[tuple[Path | None, str]],
     board: Target | BoardOfCorners,
     failures: list[str],
-    doubtful: list[str],
+    suspect: list[str],
     report: Report,
 ) -> Views:
     """What a camera sees in each of its pictures, NaN where there is none or it does not show enough; `failures` grows
-    by a line for each that is not used, `doubtful` by the names of those that noise does not describe.
+    by a line for each that is not used, `suspect` by the names of those that noise does not describe.
 
     CalibrationError when the target is in none, or they are of different sizes.
     """
@@ -291,7 +291,7 @@ def collect_views(
             continue
         try:
             pixels = read_image(path)
-            found, covariance, is_doubtful = _measure_points(pixels, board)
+            found, covariance, is_suspect = _measure_points(pixels, board)
         except DetectionError as error:
             failures.append(f"{name}: {str(error).removeprefix(f'{path}: ')}")
             continue
@@ -303,7 +303,7 @@ def collect_views(
         if count < LEAST_MARKERS:
             failures.append(f"{name}: {count} markers, {LEAST_MARKERS} are needed")
             continue
-        doubtful += [name] * is_doubtful
+        suspect += [name] * is_suspect
         centres[number], covariances[number] = found, covariance
     if size is None:
         raise CalibrationError(
@@ -313,9 +313,9 @@ def collect_views(
 
 
 def _measure_points(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
-    """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are doubtful; DetectionError
+    """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are suspect; DetectionError
     when the target is not in it."""
     if isinstance(target, Target):
         found = detect(image, target)
-        return found.centres_px, found.covariance_px2, found.is_doubtful
+        return found.centres_px, found.covariance_px2, found.is_suspect
     return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1)), False

@@ -60,8 +60,8 @@ def validate_session(
     numbers_path = _choose_numbers_path(out)
     file, drift = load_camera(camera), load_model(model)
     calibrated = select_lens_model(file, lens)
-    if lens is LensModel.RAYS and file.rays_doubt:
-        say(file.rays_doubt)
+    if lens is LensModel.RAYS and file.rays_warning:
+        say(file.rays_warning)
     geometry = None if budget is None else load_geometry(budget)
     opened = Session.open(session)
     observations = finding.observed([session], find_camera_name(opened, file.camera_serial))

@@ -78,21 +78,21 @@ class MeasuredQuantity:
         return COVERAGE * self.u
 
 
-def pool_sessions(nights: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
+def pool_sessions(by_session: Sequence[MeasuredQuantity]) -> MeasuredQuantity:
     """Return the mean of the same quantity over sessions.
 
     What the statistics of each session say shrinks with the number of sessions. What is of type B is common to all. How
     the sessions differ is a contribution of its own."""
-    known = [one for one in nights if not math.isnan(one.value)]
+    known = [one for one in by_session if not math.isnan(one.value)]
     if len(known) < 2:
-        return known[0] if known else nights[0]
+        return known[0] if known else by_session[0]
     values = [one.value for one in known]
     count = len(known)
     lines: list[Contribution] = []
     for same in zip(*(one.contributions for one in known), strict=True):
         amounts = np.array([line.amount for line in same])
-        a_night = math.sqrt(float((amounts**2).mean()))
-        amount = a_night / math.sqrt(count) if same[0].kind == "A" else a_night
+        session_rms = math.sqrt(float((amounts**2).mean()))
+        amount = session_rms / math.sqrt(count) if same[0].kind == "A" else session_rms
         sensitivity = same[0].sensitivity or 1.0
         lines.append(replace(same[0], u=amount / abs(sensitivity), sensitivity=sensitivity))
     spread = float(np.std(values, ddof=1)) / math.sqrt(count)
@@ -517,14 +517,14 @@ def _compute_surroundings_share(share: MeasuredQuantity) -> MeasuredQuantity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Datasheet:
-    """quantities: in the order of the page. nights: the same of each single session. warming: the first warm-up.
+    """quantities: in the order of the page. by_session: the same of each single session. warming: the first warm-up.
     air_degC, camera_degC: range of the visits. model: in use."""
 
     observations: Observations
     details: MeasurementDetails
     model: DriftModel
     quantities: tuple[MeasuredQuantity, ...]
-    nights: tuple[tuple[MeasuredQuantity, ...], ...]
+    by_session: tuple[tuple[MeasuredQuantity, ...], ...]
     visits: tuple[Visits, ...]
     warming: Warming | None
     air_degC: tuple[float, float]
@@ -545,7 +545,7 @@ def compute_datasheet(
     moved = fit_motions(steady)
     of_session = {one.session_id: one for one in compute_hysteresis(steady)}
     evaluations = _evaluate_forms(model, observations)
-    nights: list[tuple[MeasuredQuantity, ...]] = []
+    by_session: list[tuple[MeasuredQuantity, ...]] = []
     visits: list[Visits] = []
     warmings: list[Warming | None] = []
     for index, facts in enumerate(observations.sessions):
@@ -555,16 +555,16 @@ def compute_datasheet(
         scatter = _estimate_unrepeated(own, model)
         visits.append(own)
         warmings.append(find_warm_up(steady, moved, index))
-        nights.append(
+        by_session.append(
             (
                 *compute_coefficients(own, details.u_air_K, details.u_target_ppm_per_K),
                 *compute_warm_up_quantities(warmings[-1], own, scatter, details.u_air_K),
                 *compute_hysteresis_quantities(of_session.get(facts.session_id), scatter),
             )
         )
-    if not nights:
+    if not by_session:
         raise SessionError("no session has frames at set-points with a known air temperature; there is no datasheet")
-    of_nights = [pool_sessions(same) for same in zip(*nights, strict=True)]
+    pooled = [pool_sessions(same) for same in zip(*by_session, strict=True)]
     scatter = _estimate_unrepeated(visits[0], model)
     left = [one for form in FORMS for one in compute_residual_quantities(form, evaluations.get(form), scatter)]
     whole = _concatenate_visits(visits)
@@ -572,8 +572,8 @@ def compute_datasheet(
         observations=observations,
         details=details,
         model=model,
-        quantities=(*of_nights, *left),
-        nights=tuple(nights),
+        quantities=(*pooled, *left),
+        by_session=tuple(by_session),
         visits=tuple(visits),
         warming=next((one for one in warmings if one is not None), None),
         air_degC=(float(whole.air_degC.min()), float(whole.air_degC.max())),

@@ -100,8 +100,8 @@ _Term = Annotated[Term, BeforeValidator(parse_term), PlainSerializer(_serialise_
 
 class ThermalFile(_File):
     """The thermal form. coefficient_covariance_px2 (8 H, H): of each motion one below the other. least_on_s: null when
-    the camera was never switched on within the record. between_nights_px: one standard deviation of what a session
-    that was not fitted adds, null where that is not known; with nights_compared 0 it was assumed, not measured."""
+    the camera was never switched on within the record. between_sessions_px: one standard deviation of what a session
+    that was not fitted adds, null where that is not known; with sessions_compared 0 it was assumed, not measured."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[_Term, ...]
@@ -116,8 +116,8 @@ class ThermalFile(_File):
     leverage_matrix_px2: Rows
     leverage_px2: Annotated[float, Field(gt=0)]
     history_s: NotNegative
-    between_nights_px: Spread | None
-    nights_compared: Annotated[int, Field(ge=0)]
+    between_sessions_px: Spread | None
+    sessions_compared: Annotated[int, Field(ge=0)]
     other: PaperFile | None = None
 
 
@@ -194,8 +194,8 @@ def _list_thermal_fields(model: ThermalModel) -> dict[str, object]:
         "least_on_s": None if math.isinf(model.valid.least_on_s) else model.valid.least_on_s,
         "leverage_px2": model.valid.leverage,
         "history_s": model.history_s,
-        "between_nights_px": None if model.between_nights is None else model.between_nights.sigma_px,
-        "nights_compared": 0 if model.between_nights is None else model.between_nights.nights,
+        "between_sessions_px": None if model.between_sessions is None else model.between_sessions.sigma_px,
+        "sessions_compared": 0 if model.between_sessions is None else model.between_sessions.sessions,
     }
 
 
@@ -256,9 +256,9 @@ def _build_thermal_model(file: ThermalFile) -> ThermalModel:
         ),
         has_warm_up=file.has_warm_up,
         candidates=file.candidates,
-        between_nights=None
-        if file.between_nights_px is None
-        else BetweenSessions(file.between_nights_px, file.nights_compared),
+        between_sessions=None
+        if file.between_sessions_px is None
+        else BetweenSessions(file.between_sessions_px, file.sessions_compared),
     )
 
 

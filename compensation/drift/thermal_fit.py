@@ -287,23 +287,27 @@ def _compute_left_out_sessions_px2(taught: _ThermalFit) -> Float:
     """(N, 2): mean square that a fit of the other sessions leaves of each session, noise taken off. It shows what of
     the drift does not repeat between them. Only sessions that can be compared have a row."""
     trained, rows = taught.trained, taught.rows
-    night = trained.observations.session[rows.frame].astype(float)
-    nights = [index for index in np.unique(night).tolist() if _is_covered_by_others(rows.chamber_degC, night, index)]
-    if not nights:
+    session_index = trained.observations.session[rows.frame].astype(float)
+    covered = [
+        index
+        for index in np.unique(session_index).tolist()
+        if _is_covered_by_others(rows.chamber_degC, session_index, index)
+    ]
+    if not covered:
         return np.zeros((0, 2))
-    own = rows.where(np.isin(night, nights))
-    night = trained.observations.session[own.frame].astype(float)
+    own = rows.where(np.isin(session_index, covered))
+    session_index = trained.observations.session[own.frame].astype(float)
     left = _compute_held_out_residuals(
-        trained, taught.learned, own, taught.learned.instants.session.astype(float), night
+        trained, taught.learned, own, taught.learned.instants.session.astype(float), session_index
     )
     squares = left**2 - own.variance_px2
-    return np.array([squares[night == index].mean(axis=0) for index in nights])
+    return np.array([squares[session_index == index].mean(axis=0) for index in covered])
 
 
-def _is_covered_by_others(chamber_degC: Float, night: Float, index: float) -> bool:
+def _is_covered_by_others(chamber_degC: Float, session_index: Float, index: float) -> bool:
     """Whether the other sessions were at all set-points of this one, and at most of all: otherwise a fit without it has
     to extrapolate."""
-    own, others = set(chamber_degC[night == index].tolist()), set(chamber_degC[night != index].tolist())
+    own, others = set(chamber_degC[session_index == index].tolist()), set(chamber_degC[session_index != index].tolist())
     return bool(own) and own <= others and len(others) >= _MOST_OF * len(own | others)
 
 
@@ -339,7 +343,7 @@ def _make_model(taught: _ThermalFit, heating_K: float) -> ThermalModel:
         valid=_compute_range(trained),
         has_warm_up=bool(trained.observations.of(Role.WARM_UP).any()),
         candidates=(_make_candidate(taught),),
-        between_nights=estimate_between_sessions(left_px, _compute_left_out_sessions_px2(taught)),
+        between_sessions=estimate_between_sessions(left_px, _compute_left_out_sessions_px2(taught)),
     )
     largest = float(found.compute_leverage(trained.states.where(np.unique(trained.rows.frame))).max())
     return replace(found, valid=replace(found.valid, leverage=largest, history_s=_compute_history_s(found)))

@@ -42,16 +42,16 @@ _SIGMA_95, _TAIL = 1.959964, 0.975
 
 @dataclass(frozen=True, slots=True)
 class BetweenSessions:
-    """sigma_px: along I and J; 1.96 times it is half of the 95 % interval of what another session adds. nights: how
+    """sigma_px: along I and J; 1.96 times it is half of the 95 % interval of what another session adds. sessions: how
     many sessions were compared with others; 0: it was assumed, not measured."""
 
     sigma_px: Pair
-    nights: int
+    sessions: int
 
     @property
     def is_assumed(self) -> bool:
         """Whether no two sessions were compared."""
-        return self.nights == 0
+        return self.sessions == 0
 
     @property
     def text(self) -> str:
@@ -62,20 +62,20 @@ class BetweenSessions:
                 f"how well sessions repeat was assumed, not measured: {i:.1f} mpx (I) and {j:.1f} mpx (J) are added in "
                 "sessions that were not fitted; a second one over the same set-points, in another order, measures it"
             )
-        shown = "one session shows" if self.nights == 1 else f"{self.nights} sessions show"
+        shown = "one session shows" if self.sessions == 1 else f"{self.sessions} sessions show"
         return f"sessions repeat to {i:.1f} mpx (I) and {j:.1f} mpx (J), as {shown}"
 
 
 def estimate_between_sessions(discrepancy_px: Float, left_px2: Float) -> BetweenSessions:
     """discrepancy_px (2,): what is left at set-points left out, within sessions. left_px2 (N, 2): mean square that
     is left of each of N sessions by a fit of the others, noise taken off; (0, 2) where none can be compared."""
-    nights = len(left_px2)
+    sessions = len(left_px2)
     assumed_px2 = _LEAST_PX**2 + (_OF_DISCREPANCY * discrepancy_px) ** 2
     measured_px2 = np.maximum(left_px2 - discrepancy_px**2, 0.0).sum(axis=0)
-    freedom = _PRIOR_SESSIONS + nights
+    freedom = _PRIOR_SESSIONS + sessions
     variance_px2 = (_PRIOR_SESSIONS * assumed_px2 + measured_px2) / freedom
     i, j = (np.sqrt(variance_px2) * float(stdtrit(freedom, _TAIL)) / _SIGMA_95).tolist()
-    return BetweenSessions((i, j), nights)
+    return BetweenSessions((i, j), sessions)
 
 
 # Three times the variance of the least known state of the fit. Plays of parts are taken as known here: with their
@@ -105,7 +105,7 @@ class ThermalModel(DriftModel):
     the covariance has beyond that; it says which states are like those of the fit.
 
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
-    the shift at the reference is about 0. discrepancy_px is within sessions. between_nights: what another session adds
+    the shift at the reference is about 0. discrepancy_px is within sessions. between_sessions: what another one adds
     to it, which `covariance` contains; None in older models, in which the discrepancy has it, and of sessions that were
     fitted. has_warm_up: whether a warm-up was among the training frames.
     """
@@ -120,7 +120,7 @@ class ThermalModel(DriftModel):
     leverage_matrix: Float
     valid: ThermalRange
     has_warm_up: bool
-    between_nights: BetweenSessions | None = None
+    between_sessions: BetweenSessions | None = None
 
     @property
     def title(self) -> str:
@@ -156,13 +156,13 @@ class ThermalModel(DriftModel):
         )
         of_coefficients = (moved * variance[:, None, :]) @ moved.transpose(0, 2, 1)
         unexplained = of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
-        known = self.between_nights
+        known = self.between_sessions
         return unexplained if known is None else unexplained + np.diag(np.square(known.sigma_px))
 
     def of_sessions(self, session_ids: Iterable[str]) -> ThermalModel:
         """The model for these sessions: where it was fitted to all of them, without what other sessions add."""
         is_own = set(session_ids) <= set(self.facts.session_ids)
-        return replace(self, between_nights=None) if is_own else self
+        return replace(self, between_sessions=None) if is_own else self
 
     def flags(self, xy_px: Float, state: Situation) -> Flags:
         """(N,): of Outside."""

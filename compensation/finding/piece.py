@@ -64,7 +64,7 @@ class FoundMarkers:
     """K frames with N markers. time_ns (K,) int64 and block (K,) int64 (low 32 bits of the block id) name the frames;
     size_px (K, 2): width and height. centres_px (K, N, 2), covariance_px2 (K, N, 2, 2), chi (K, N): NaN for a marker
     without a centre. flags (K, N) uint8: of markers.Flag. homography (K, 3, 3): target mm -> px, NaN when the target
-    was not found. doubtful (K,): the noise model does not describe the frame. reason (K) str: why the target was not
+    was not found. suspect (K,): the noise model does not describe the frame. reason (K) str: why the target was not
     found, else ""."""
 
     time_ns: NDArray[np.int64]
@@ -75,7 +75,7 @@ class FoundMarkers:
     chi: Float
     flags: NDArray[np.uint8]
     homography: Float
-    doubtful: NDArray[np.bool_]
+    suspect: NDArray[np.bool_]
     reason: NDArray[np.str_]
 
 
@@ -125,7 +125,7 @@ def find_markers(piece: Piece) -> FoundMarkers:
         chi=np.array([detection.chi for detection in found]),
         flags=np.array([detection.flags for detection in found], np.uint8),
         homography=np.array([detection.homography for detection in found]),
-        doubtful=np.array([detection.is_doubtful for detection in found], bool),
+        suspect=np.array([detection.is_suspect for detection in found], bool),
         reason=np.array([row[3] for row in rows], np.str_),
     )
 

@@ -195,8 +195,8 @@ def serialise_datasheet(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str
         "stated": sheet.details.model_dump(exclude_defaults=True),
         "versions": _read_versions(),
         "quantities": [_serialise_quantity(one) for one in sheet.quantities],
-        "nights": [[_serialise_quantity(one) for one in night] for night in sheet.nights]
-        if len(sheet.nights) > 1
+        "quantities_by_session": [[_serialise_quantity(one) for one in session] for session in sheet.by_session]
+        if len(sheet.by_session) > 1
         else [],
     }
     return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -59,8 +59,8 @@ class TablePositions:
 
 @dataclass(frozen=True, slots=True)
 class SessionNumbers:
-    """frames_by_role, flags: how many of each. centres: in usable frames; set_aside: of them, with a flag.
-    doubtful: frames that the noise model does not describe."""
+    """frames_by_role, flags: how many of each. centres: in usable frames; excluded: of them, with a flag.
+    suspect: frames that the noise model does not describe."""
 
     session_id: str
     recipe: str
@@ -76,9 +76,9 @@ class SessionNumbers:
     chamber_degC: tuple[float, ...]
     camera_degC: Pair
     centres: int
-    set_aside: int
+    excluded: int
     flags: dict[str, int]
-    doubtful: int
+    suspect: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +159,8 @@ class FormulaNumbers:
 
 @dataclass(frozen=True, slots=True)
 class ModelNumbers:
-    """candidates: every form tried, with its errors at temperatures left out. between_nights_px: what a session that
-    was not fitted adds, None where that is not known; with nights_compared 0 it was assumed, not measured."""
+    """candidates: every form tried, with its errors at temperatures left out. between_sessions_px: what a session that
+    was not fitted adds, None where that is not known; with sessions_compared 0 it was assumed, not measured."""
 
     form: str
     title: str
@@ -169,8 +169,8 @@ class ModelNumbers:
     camera_range_degC: Pair
     hull_px: tuple[Pair, ...]
     discrepancy_px: Pair
-    between_nights_px: Pair | None
-    nights_compared: int
+    between_sessions_px: Pair | None
+    sessions_compared: int
     session_ids: tuple[str, ...]
     software_version: str
     formula: FormulaNumbers
@@ -286,9 +286,9 @@ def _summarise_session(observations: Observations, index: int) -> SessionNumbers
         chamber_degC=_list_set_points(observations, own),
         camera_degC=_compute_extent(observations.camera_degC[used]),
         centres=flags.size,
-        set_aside=int(np.count_nonzero(flags)),
+        excluded=int(np.count_nonzero(flags)),
         flags={flag: count for flag, count in by_flag.items() if count},
-        doubtful=facts.doubtful,
+        suspect=facts.suspect,
     )
 
 
@@ -368,7 +368,7 @@ def _summarise_score(evaluation: Evaluation) -> ScoreNumbers:
 
 def _describe_model(model: DriftModel) -> ModelNumbers:
     facts = model.facts
-    known = model.between_nights if isinstance(model, ThermalModel) else None
+    known = model.between_sessions if isinstance(model, ThermalModel) else None
     return ModelNumbers(
         form=model.form,
         title=model.title,
@@ -377,8 +377,8 @@ def _describe_model(model: DriftModel) -> ModelNumbers:
         camera_range_degC=facts.camera_range_degC,
         hull_px=tuple((x, y) for x, y in facts.hull_px.tolist()),
         discrepancy_px=make_pair(model.discrepancy_px),
-        between_nights_px=None if known is None else known.sigma_px,
-        nights_compared=0 if known is None else known.nights,
+        between_sessions_px=None if known is None else known.sigma_px,
+        sessions_compared=0 if known is None else known.sessions,
         session_ids=facts.session_ids,
         software_version=facts.software_version,
         formula=describe_formula(model),

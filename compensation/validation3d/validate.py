@@ -126,7 +126,7 @@ def _group_places(
     """The frames at each place, and of the return to the first."""
     found = {(_get_sent_position(visits[step_id]), visits[step_id].role): seen[step_id] for step_id in steps}
     nothing = np.empty(0, np.int64)
-    posed = [found.get((there, str(Role.POSE)), nothing) for there in places]
+    posed = [found.get((place, str(Role.POSE)), nothing) for place in places]
     return (*posed, found.get((places[0], str(Role.REPEATABILITY)), nothing))
 
 
@@ -179,7 +179,7 @@ class FoundPose:
 
 
 def find_target_pose(
-    lens: Lens, board: Board, mean: MeanCentres, growth: float, doubts: CentreUncertainty, image_width_px: int
+    lens: Lens, board: Board, mean: MeanCentres, growth: float, uncertainty: CentreUncertainty, image_width_px: int
 ) -> FoundPose:
     """Pose from mean centres, their covariances times `growth`. CalibrationError when the markers give no pose."""
     covariance_px2 = mean.covariance_px2 * growth
@@ -189,10 +189,12 @@ def find_target_pose(
     about_middle = _make_lever_matrix(pose, compute_middle_mm(board))
     gain = about_middle @ _compute_gain(lens, board.points_mm[seen], pose, pixels, covariance_px2[seen])
     model, stand = np.zeros((6, 6)), np.zeros((6, 6))
-    if doubts.model_px2 is not None:
-        model = gain @ _compute_field_covariance(pixels, doubts.model_px2[seen], _CORRELATED * image_width_px) @ gain.T
-    if doubts.errors_px is not None:
-        moved = doubts.errors_px[:, seen].reshape(len(doubts.errors_px), -1) @ gain.T
+    if uncertainty.model_px2 is not None:
+        model = (
+            gain @ _compute_field_covariance(pixels, uncertainty.model_px2[seen], _CORRELATED * image_width_px) @ gain.T
+        )
+    if uncertainty.errors_px is not None:
+        moved = uncertainty.errors_px[:, seen].reshape(len(uncertainty.errors_px), -1) @ gain.T
         stand = moved.T @ moved
     noise = about_middle @ pose.covariance @ about_middle.T
     return FoundPose(pose.locate_point_mm(compute_middle_mm(board)), pose.rotation, noise, model, stand, pose.chi)
@@ -327,9 +329,9 @@ def compute_deviations(
     for row, indices in zip(means, frames.frames, strict=True):
         grid.append([])
         for mean, chosen in zip(row, indices, strict=True):
-            doubts = _average_uncertainty(chosen, model_px2, errors_px)
+            uncertainty = _average_uncertainty(chosen, model_px2, errors_px)
             grid[-1].append(
-                None if mean is None else find_target_pose(camera.lens, camera.board, mean, growth, doubts, width)
+                None if mean is None else find_target_pose(camera.lens, camera.board, mean, growth, uncertainty, width)
             )
     return _compare_poses(name, frames.names, grid)
 

@@ -59,7 +59,7 @@ def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:
 
 class _SerialLink:
     """A port opened by pyserial. Its bytes go by the descriptor: pyserial waits twice for each reply, and after each
-    request for room for the next one."""
+    request for space for the next one."""
 
     def __init__(self, device: str, path: str, where: str, settings: SerialSettings) -> None:
         self._device = device
@@ -81,7 +81,7 @@ class _SerialLink:
     def write(self, data: bytes) -> None:
         try:
             if rest := data[_write_at_once(self._port.fileno(), data) :]:
-                self._port.write(rest)  # waits for room
+                self._port.write(rest)  # waits for space
         except (OSError, termios.error) as error:
             raise Unreachable(self._device, f"{self._where} is gone ({error})") from error
 
@@ -105,7 +105,7 @@ class _SerialLink:
 
 
 def _write_at_once(port: int, data: bytes) -> int:
-    """How many bytes the port has room for."""
+    """How many bytes the port has space for."""
     try:
         return os.write(port, data)
     except BlockingIOError:

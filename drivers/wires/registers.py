@@ -195,7 +195,7 @@ class RegisterMap(Document):
     """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are.
     `when_silent`: what to look at when it does not answer. identity: where the unit tells its serial number, model and
     version; a unit that refuses such a point does not tell it. in_force: of a regulator, what shows that the set-point
-    written is the one that acts; not_told: what of that no register shows."""
+    written is the one that acts; unverified: what of that no register shows."""
 
     schema_: Literal["regmap/1"] = Field(alias="schema")
     vendor: str
@@ -208,7 +208,7 @@ class RegisterMap(Document):
     points: dict[str, Point] = Field(min_length=1)
     fault_bits: tuple[str, ...] = ()
     in_force: tuple[InForceCheck, ...] = ()
-    not_told: str = ""
+    unverified: str = ""
     commands: dict[str, RegisterCommand] = Field(default_factory=dict)
     startup: tuple[str, ...] = ()
     safe_state: tuple[str, ...] = ()

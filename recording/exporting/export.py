@@ -61,7 +61,7 @@ Values   An empty cell is what the device does not measure; nan is what it could
 Frames   Columns of frames.csv: file (the image here, else the recorded segment that has it); camera; step_id, the step
          of the plan that took it; role, what for; superseded, yes when the capture was begun again later;
          set_point_degC of the chamber; camera_temperature_degC, the camera's own; flags, why a fit leaves it out
-         (temperature_in_doubt, unsettled); for each thermometer the last
+         (temperature_suspect, unsettled); for each thermometer the last
          reading (NAME_degC, in degrees Celsius) and how old it was (NAME_age_s, in seconds); NAME_position_mm or
          NAME_position_deg of each stage, in millimetres or degrees, interpolated to the middle of the exposure.
 Texts    Cells of the CSV tables are safe for spreadsheets, also of a stranger's session. A text that a spreadsheet
@@ -163,10 +163,10 @@ def _write_facts(session: Session, folder: Path) -> None:
 
 
 def _iterate_note_rows(session: Session) -> Iterator[Sequence[Cell]]:
-    said = read_notes(session.path)
-    for note in said.notes:
+    by_operator = read_notes(session.path)
+    for note in by_operator.notes:
         yield (note.time_ns, note.by, "note", note.text)
-    for tag in said.tags:
+    for tag in by_operator.tags:
         yield (None, None, "tag", tag)
 
 

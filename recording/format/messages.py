@@ -151,7 +151,7 @@ CLASSES: Mapping[str, type[Message]] = {
     ORIGINAL: CompressedImage,
 }
 
-CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "alarm", "doubt": "doubt"}
+CAUSES: Mapping[str, Cause] = {"wire": "wire", "device": "device", "alarm": "alarm", "suspect": "suspect"}
 LOG_LEVEL = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 

@@ -105,7 +105,7 @@ def make_entry(seen: Scan, contents: str = "") -> ListedSession:
     """What a list shows of a session that was looked at."""
     from thermostand.recording.reading.run_status import Files
 
-    said = read_notes(seen.path)
+    by_operator = read_notes(seen.path)
     return ListedSession(
         path=seen.path,
         metadata=dict(seen.metadata),
@@ -125,9 +125,9 @@ def make_entry(seen: Scan, contents: str = "") -> ListedSession:
         troubles=seen.sentences(Files.DAMAGED),
         missing=seen.sentences(Files.INCOMPLETE),
         contents=contents or compute_contents_digest(seen.path),
-        notes=said.notes,
-        tags=said.tags,
-        copies=said.archived,
+        notes=by_operator.notes,
+        tags=by_operator.tags,
+        copies=by_operator.archived,
     )
 
 

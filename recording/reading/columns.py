@@ -78,7 +78,7 @@ class ReadingColumns:
         self._single: dict[
             tuple[str, str], list[tuple[int, int, float]]
         ] = {}  # (device, channel) -> number, time, value
-        self.doubted: dict[str, list[int]] = {}  # by channel: the instants, ns, of readings with cause "doubt"
+        self.suspect: dict[str, list[int]] = {}  # by channel: the instants, ns, of readings with cause "suspect"
         self.units: dict[str, str] = {}  # by channel
         self._count = 0
 
@@ -115,8 +115,8 @@ class ReadingColumns:
     def _add_singly(self, batch: Batch) -> None:
         for reading in batch.readings:
             channel = self._name_channel(reading.channel, reading.unit)
-            if reading.cause == "doubt":
-                self.doubted.setdefault(channel, []).append(reading.time_ns)
+            if reading.cause == "suspect":
+                self.suspect.setdefault(channel, []).append(reading.time_ns)
             single = self._single.setdefault((batch.device, channel), [])
             single.append((self._count, reading.time_ns, reading.value))
 

@@ -546,8 +546,8 @@ class _SessionScanner:
             if is_misplaced(file.series, file.number, each.place, each.session):
                 yield _make_error("records another place in the session than its name", file.name)
             if each.salvage:
-                said = ", ".join(f"{key}: {text}" for key, text in each.salvage.items())
-                yield _make_note(f"was repaired ({said})", file.name)
+                repairs = ", ".join(f"{key}: {text}" for key, text in each.salvage.items())
+                yield _make_note(f"was repaired ({repairs})", file.name)
 
     def _find_changed_texts(self) -> Iterator[SessionFinding]:
         """Every segment has the same texts attached, and they are those that the recording began with."""
@@ -557,13 +557,13 @@ class _SessionScanner:
                 yield _make_error("has other texts attached than the other segments", each.file.name)
         if not sound:
             return
-        told: set[str] = set()
+        reported: set[str] = set()
         stated = {JOURNAL_NAME: None if self._journal is None else self._journal.texts}
         stated[MANIFEST_NAME] = self._manifest.texts if isinstance(self._manifest, Manifest) else None
         for where, texts in stated.items():
             for name, known in (texts or {}).items():
-                if name not in told and hash_text(self._texts.get(name)) != known:
-                    told.add(name)
+                if name not in reported and hash_text(self._texts.get(name)) != known:
+                    reported.add(name)
                     yield _make_error(f"{name} is not attached as the run began with it, by {where}")
         listed = stated[MANIFEST_NAME]
         for name in sorted(self._texts.keys() - (self._texts if listed is None else listed).keys()):
@@ -976,11 +976,11 @@ def _check_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -
 
 def _check_notes(path: Path) -> Iterator[SessionFinding]:
     """Check the notes that people wrote about the session."""
-    said = read_notes(path)
-    if said.damage:
-        yield _make_error(said.damage, NOTES_NAME)
-    if said.unended:
-        yield _make_note(said.unended, NOTES_NAME)
+    by_operator = read_notes(path)
+    if by_operator.damage:
+        yield _make_error(by_operator.damage, NOTES_NAME)
+    if by_operator.unended:
+        yield _make_note(by_operator.unended, NOTES_NAME)
 
 
 def _check_format(session: Mapping[str, str]) -> Iterator[SessionFinding]:

@@ -158,7 +158,7 @@ class Session:
         return found
 
     def believed(self, channel: str) -> ChannelColumn:
-        """As `readings`, without those that were recorded as suspect (cause "doubt")."""
+        """As `readings`, without those that were recorded as suspect (cause "suspect")."""
         times_ns, values = self.readings(channel)
         kept = ~np.isin(times_ns, self._uncertain.get(channel, []))
         return ChannelColumn(times_ns[kept], values[kept])
@@ -181,7 +181,7 @@ class Session:
         with name_file_in_errors(self.path / TELEMETRY):
             columns = found.columns()
         self._units |= found.units
-        self._uncertain |= found.doubted
+        self._uncertain |= found.suspect
         return columns
 
     def steps(self) -> list[StepMark]:

@@ -244,9 +244,9 @@ class Recorder:
             self._plan = {}
             await self._telemetry.lane.call(self._telemetry.series.plan, plan)
 
-    def tell(self, kind: EventKind, said: str) -> None:
+    def tell(self, kind: EventKind, text: str) -> None:
         """An event of this kind with the next report; from any thread."""
-        self._notices.append(kind.at(0, said))
+        self._notices.append(kind.at(0, text))
 
     async def _on_ticks(self, work: Callable[[int], Awaitable[None]]) -> None:
         """At each instant at which the telemetry is committed."""

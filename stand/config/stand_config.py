@@ -441,7 +441,7 @@ def _resolve_path(path: Path, name: str) -> str:
     return str(file.absolute()) if is_another else name
 
 
-def find_packaged(folder: Folder, name: str, beside: Path | None = None, key: str = "") -> Path:
+def find_packaged(folder: Folder, name: str, relative_to: Path | None = None, key: str = "") -> Path:
     """The file `name` of the installed configs/`folder`, or `name` itself when that is a path that exists; first of all
     next to the file that names it, under `key`.
 
@@ -449,14 +449,19 @@ def find_packaged(folder: Folder, name: str, beside: Path | None = None, key: st
     """
     root = Path(str(importlib.resources.files("thermostand.configs"))) / folder
     known = sorted(path.stem for path in root.glob("*.yaml"))
-    named_by = (f"{beside}: " if beside else "") + (f"{key}: " if key else "")
-    for candidate in (beside.parent / name if beside else Path(name), Path(name), root / name, root / f"{name}.yaml"):
+    named_by = (f"{relative_to}: " if relative_to else "") + (f"{key}: " if key else "")
+    for candidate in (
+        relative_to.parent / name if relative_to else Path(name),
+        Path(name),
+        root / name,
+        root / f"{name}.yaml",
+    ):
         try:
             if candidate.is_file():
                 return candidate
         except OSError as error:  # such as a name longer than the file system takes
             raise ConfigError(f"{named_by}{name}: cannot be looked up ({error.strerror})") from error
-    if any(path.is_dir() for path in (Path(name), *((beside.parent / name,) if beside else ()))):
+    if any(path.is_dir() for path in (Path(name), *((relative_to.parent / name,) if relative_to else ()))):
         raise ConfigError(
             f"{named_by}{name}: is a folder; give a file in it, or one of those installed: {', '.join(known)}"
         )

@@ -31,20 +31,20 @@ _MOST_SESSIONS = 5  # as far back as a stand is likely to be as it is now
 class LearnedDurations(Document):
     """The chamber's model, and per kind of work (durations.Expectation) what it takes beyond what is stated, s.
 
-    `nights`: the sessions it is learned from, none when all are defaults.
+    `learned_from`: the sessions it is learned from, none when all are defaults.
     """
 
     chamber: ChamberModel = ChamberModel()
     overheads_s: dict[str, float] = Field(default_factory=dict)
-    nights: tuple[str, ...] = ()
+    learned_from: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """One line about where the estimates come from."""
-        if not self.nights:
+        if not self.learned_from:
             return "estimates are defaults; they are learned from recorded runs"
         model = self.chamber
         return (
-            f"estimates as learned from {len(self.nights)} runs, the last {self.nights[-1]} "
+            f"estimates as learned from {len(self.learned_from)} runs, the last {self.learned_from[-1]} "
             f"({model.heating_ramps} ramps up, {model.cooling_ramps} down)"
         )
 
@@ -78,13 +78,13 @@ def learn_durations(directory: Path, config: StandConfig) -> LearnedDurations:
         return load_learned_durations(directory)
     seen_s: defaultdict[str, list[float]] = defaultdict(list)
     chamber = fit_chamber_model([ramp for estimate in sessions for ramp in estimate.ramps])
-    for night in sessions:
-        for work, overhead_s in compute_overheads(night.marks, config, chamber):
+    for each in sessions:
+        for work, overhead_s in compute_overheads(each.marks, config, chamber):
             seen_s[work].append(overhead_s)
     learned = LearnedDurations(
         chamber=chamber,
         overheads_s={work: round(median(values_s), 3) for work, values_s in sorted(seen_s.items())},
-        nights=tuple(sorted(night.name for night in sessions)),
+        learned_from=tuple(sorted(each.name for each in sessions)),
     )
     _replace(directory / LEARNED_FILE, learned.model_dump_json(indent=2))
     return learned

@@ -1,9 +1,9 @@
 """One check of every temperature that a model or a rule uses: outside its range, jumped, noisy, or stuck.
 
 Each channel is judged against itself: how fast it can move (the lag of what it measures), the steps in which it is
-shown, and the channel that it follows. What is suspect is recorded as STALE with cause "doubt"; it stays a reading, for
-whether heat may go on is the guard's business. No reading shows that it is wrong before it jumps, so that one which is
-wrong from the begin is found only where physics says so: a camera that is at rest is warmer than its air.
+shown, and the channel that it follows. What is suspect is recorded as STALE with cause "suspect"; it stays a reading,
+for whether heat may go on is the guard's business. No reading shows that it is wrong before it jumps, so that one which
+is wrong from the beginning is found only where physics says so: a camera that is at rest is warmer than its air.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class _ChannelState:
     rest_K: float = math.nan  # above it, when both were last at rest
     still_degC: float = math.nan  # where it has stayed itself, since
     still_ns: int = 0
-    doubted: _Suspicion | None = None
+    suspicion: _Suspicion | None = None
 
 
 class ChannelCheck:
@@ -159,14 +159,14 @@ class ChannelCheck:
         if channel not in self._natures or math.isnan(value):
             return ""
         self._report(self._judge(channel, value, time_ns, math.inf, is_poll=False), channel, [channel], time_ns)
-        suspect = self._seen[channel].doubted
+        suspect = self._seen[channel].suspicion
         return "" if suspect is None else suspect.text
 
     def _mark(self, reading: Reading) -> Reading:
         seen = self._seen.get(reading.channel)
-        if seen is None or seen.doubted is None or reading.quality is Quality.BAD:
+        if seen is None or seen.suspicion is None or reading.quality is Quality.BAD:
             return reading
-        return replace(reading, quality=Quality.STALE, reason=seen.doubted.text, cause="doubt")
+        return replace(reading, quality=Quality.STALE, reason=seen.suspicion.text, cause="suspect")
 
     def _judge(
         self, channel: str, value: float, time_ns: int, fine_K: float, *, is_poll: bool
@@ -182,7 +182,7 @@ class ChannelCheck:
                 seen.step_K, seen.rest_K = before.step_K, before.rest_K
         elif (time_ns - seen.time_ns) / NS_PER_S > _WINDOW_S:
             seen.begin_ns = time_ns
-        was = seen.doubted
+        was = seen.suspicion
         self._follow(seen, nature, value, time_ns)
         has_jumped = abs(_measure_beyond_K(seen, value, time_ns)) > self._allowed_K(seen, nature, time_ns)
         if was is not None and was.rule == SENSOR_JUMPED:
@@ -193,7 +193,7 @@ class ChannelCheck:
             self._jump(channel, seen, value, time_ns, seen.recent[0])
         _record_value(seen, value, time_ns, is_poll=is_poll)
         self._judge_lasting(channel, seen, nature, fine_K)
-        now = seen.doubted
+        now = seen.suspicion
         if now is None and was is not None:
             self._report_trusted(channel, value, was, time_ns)
         is_new = now is not None and (was is None or (now is not was and now.rule != was.rule))
@@ -214,11 +214,11 @@ class ChannelCheck:
     def _get_trusted_degC(self, channel: str) -> float:
         """The last value of another channel, NaN when there is none, or that one is suspect itself."""
         other = self._seen.get(channel)
-        return math.nan if other is None or other.doubted is not None else other.value
+        return math.nan if other is None or other.suspicion is not None else other.value
 
     def _allowed_K(self, seen: _ChannelState, nature: ChannelModel, time_ns: int) -> float:
         """How far one reading may be from where the last ones lead: a step of the display, what a longer gap leaves
-        room for, and as far as its surroundings have gone while it stood still."""
+        space for, and as far as its surroundings have gone while it stood still."""
         gap_s = max(0.0, (time_ns - seen.time_ns) / NS_PER_S - _JUMP_WITHIN_S)
         still_s = (time_ns - seen.changed_ns) / NS_PER_S
         went_K = max(0.0, seen.followed_degC[1] - seen.followed_degC[0]) * _compute_share(still_s, nature.lag_s)
@@ -245,7 +245,7 @@ class ChannelCheck:
             seen, nature
         )  # what a slow body was on the way counts not
         before_K = since[1] - self._get_trusted_degC(nature.follows) if is_known else math.nan
-        seen.doubted = _Suspicion(Fault(SENSOR_JUMPED, text, "warn"), time_ns, went_K, before_K)
+        seen.suspicion = _Suspicion(Fault(SENSOR_JUMPED, text, "warn"), time_ns, went_K, before_K)
         seen.recent.clear()  # no trend leads over a jump
 
     def _watch_return(
@@ -261,13 +261,13 @@ class ChannelCheck:
         away_K = value - self._get_trusted_degC(nature.follows) - was.before_K
         is_as_before = abs(away_K) <= self._sensors.jump_K / 2 + _get_step_K(seen)
         if has_jumped and (is_as_before or abs(was.moved_K) <= self._allowed_K(seen, nature, time_ns)):
-            seen.doubted = None
+            seen.suspicion = None
         elif not is_as_before:
             was.as_before_ns = None
         elif was.as_before_ns is None:
             was.as_before_ns = time_ns
         elif (time_ns - was.as_before_ns) / NS_PER_S >= _BACK_S:
-            seen.doubted = None
+            seen.suspicion = None
 
     def _judge_lasting(self, channel: str, seen: _ChannelState, nature: ChannelModel, fine_K: float) -> None:
         """What is wrong for as long as it lasts; a jump stays one."""
@@ -277,11 +277,11 @@ class ChannelCheck:
             or self._check_stuck(channel, seen, nature, fine_K)
             or self._check_excess(channel, seen, nature)
         )
-        was = seen.doubted
+        was = seen.suspicion
         if found is None:
-            seen.doubted = was if was is not None and was.rule == SENSOR_JUMPED else None
+            seen.suspicion = was if was is not None and was.rule == SENSOR_JUMPED else None
         elif was is None or was.rule not in (found.rule, SENSOR_JUMPED) or found.rule == SENSOR_NOISY != was.rule:
-            seen.doubted = found
+            seen.suspicion = found
 
     def _check_range(self, channel: str, seen: _ChannelState, nature: ChannelModel) -> _Suspicion | None:
         low_degC, high_degC = nature.range_degC
@@ -295,7 +295,7 @@ class ChannelCheck:
         if len(last) < _NOISE_POLLS + 2:
             return None
         bends_K = [abs(c - 2 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
-        was_noisy = seen.doubted is not None and seen.doubted.rule == SENSOR_NOISY
+        was_noisy = seen.suspicion is not None and seen.suspicion.rule == SENSOR_NOISY
         limit_K = _NOISE_K * (0.5 if was_noisy else 1.0) + 2 * _get_step_K(seen)
         if median(bends_K) <= limit_K:
             return None
@@ -343,7 +343,7 @@ class ChannelCheck:
         if not low_K - slack_K <= excess_K <= high_K + slack_K:
             wanted = f"{low_K:g} to {high_K:g} K" if math.isfinite(high_K) else f"more than {low_K:g} K"
             return _Suspicion(Fault(SENSOR_IMPLAUSIBLE, f"{above}; {wanted} are expected", "warn"), seen.time_ns)
-        if math.isnan(seen.rest_K) and seen.doubted is None:
+        if math.isnan(seen.rest_K) and seen.suspicion is None:
             seen.rest_K = excess_K
         if abs(excess_K - seen.rest_K) > _EXCESS_K:
             return _Suspicion(
@@ -354,9 +354,9 @@ class ChannelCheck:
     def _report(self, began: list[tuple[str, _Suspicion]], module: str, channels: list[str], now_ns: int) -> None:
         """One event for what jumps at one instant, one for each that is suspect for another reason."""
         jumped = [(channel, suspect) for channel, suspect in began if suspect.rule == SENSOR_JUMPED]
-        for channel, doubted in began:
-            if doubted.rule != SENSOR_JUMPED:
-                self._warn(doubted.rule, [channel], doubted.text, now_ns, {})
+        for channel, suspicion in began:
+            if suspicion.rule != SENSOR_JUMPED:
+                self._warn(suspicion.rule, [channel], suspicion.text, now_ns, {})
         if not jumped:
             return
         names = [channel for channel, _ in jumped]
@@ -366,7 +366,7 @@ class ChannelCheck:
             if name not in channels and now_ns - time_ns <= _TOGETHER_S * NS_PER_S
         ]
         moved: dict[str, object] = {"moved_K": {channel: round(each.moved_K, 3) for channel, each in jumped}}
-        text = "; ".join(doubted.text for _, doubted in jumped)
+        text = "; ".join(suspicion.text for _, suspicion in jumped)
         if with_it:
             moved["together_with"] = with_it
             text = f"{text}; with it moved {', '.join(with_it)}: look at what they share, not at single cables"
@@ -398,7 +398,7 @@ class ChannelCheck:
 
     def _report_trusted(self, channel: str, value: float, was: _Suspicion, now_ns: int) -> None:
         lasted_s = (now_ns - was.time_ns) / NS_PER_S
-        data = {"rule": was.rule, "channels": [channel], "doubted_s": lasted_s, "value_degC": value}
+        data = {"rule": was.rule, "channels": [channel], "suspect_s": lasted_s, "value_degC": value}
         self._publish(SENSOR_BELIEVED.at(now_ns, was.text, **data))
 
 

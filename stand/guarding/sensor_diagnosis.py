@@ -95,9 +95,9 @@ class SensorHistory:
 
     def find_suspect(self, pair: tuple[str, str], readings: Readings) -> Suspicion:
         """Which of both moved unlike the rest."""
-        doubted = [name for name in pair if is_suspect(readings, name)]
-        if len(doubted) == 1:
-            return Suspicion(doubted[0])
+        suspects = [name for name in pair if is_suspect(readings, name)]
+        if len(suspects) == 1:
+            return Suspicion(suspects[0])
         now = {name: get_value(readings, name) for name in pair}
         begin = self._find_last_agreement(pair, now)
         against: dict[str, list[str]] = {name: [] for name in pair}
@@ -228,7 +228,7 @@ def name_suspect(rule: Rule, pair: tuple[str, str], witnesses: SensorHistory, *,
     """A rule that compares two channels, whose fault names both and says which one moved unlike the rest. One that does
     not compare them, but judges by the first, says it only when it can be determined."""
 
-    def told(readings: Readings, now_ns: int) -> Fault | None:
+    def judge(readings: Readings, now_ns: int) -> Fault | None:
         witnesses.note(readings, now_ns)
         fault = rule(readings, now_ns)
         if fault is None:
@@ -238,7 +238,7 @@ def name_suspect(rule: Rule, pair: tuple[str, str], witnesses: SensorHistory, *,
             return fault
         return replace(fault, text=fault.text + found.words(pair), channels=pair, suspect=found.suspect)
 
-    return told
+    return judge
 
 
 def _get_trusted_value(readings: Readings, channel: str) -> float:

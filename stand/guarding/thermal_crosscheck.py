@@ -82,7 +82,7 @@ def update_window(
 ) -> tuple[CrosscheckSample, ...]:
     """The window with what is new, if that is a measurement which is not suspect; a new one after a gap."""
     reading, probe_degC = readings.latest(body), get_value(readings, probe)
-    if reading is None or math.isnan(reading.value) or reading.cause == "doubt" or math.isnan(probe_degC):
+    if reading is None or math.isnan(reading.value) or reading.cause == "suspect" or math.isnan(probe_degC):
         return looks
     if looks and reading.time_ns <= looks[-1].time_ns:
         return looks

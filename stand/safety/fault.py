@@ -109,4 +109,4 @@ def get_value(readings: Readings, channel: str) -> float:
 def is_suspect(readings: Readings, channel: str) -> bool:
     """Whether its last value is not to be believed."""
     reading = readings.known(channel)
-    return reading is not None and reading.cause == "doubt"
+    return reading is not None and reading.cause == "suspect"

@@ -70,7 +70,7 @@ async def drain(
     while (entry := await disk.call(take, directory, clock.now_ns())) is not None:
         run = _QueuedRun(directory, entry, clock, tell, disk, deadline)
         if entry.fruitless_starts >= MOST_FRUITLESS_STARTS:
-            await run.set_aside()
+            await run.give_up()
         else:
             await run.perform(run_one)
 
@@ -107,7 +107,7 @@ class _QueuedRun:
         self._deadline = deadline
         self._notes: list[asyncio.Task[None]] = []
 
-    async def set_aside(self) -> None:
+    async def give_up(self) -> None:
         """Fail without another try."""
         left = f"; `stand resume {self._directory / self._entry.session}` tries again" if self._entry.session else ""
         times = f"{self._entry.fruitless_starts} times in a row"

@@ -54,11 +54,11 @@ async def serve_interface(
 
 
 def _make_page_routes(viewing: PageData) -> Callable[[Bridge], Any]:
-    def room(bridge: Bridge) -> Any:
+    def make_routes(bridge: Bridge) -> Any:
         from thermostand.stand.serving.page_routes import (
             PageRoutes,  # FastAPI, which the thread loads that serves clients
         )
 
         return PageRoutes(viewing)(bridge)
 
-    return room
+    return make_routes

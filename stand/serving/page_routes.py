@@ -100,7 +100,7 @@ class FrameFacts(BaseModel):
 
 
 class PageRoutes:
-    """`Interface.rooms` takes it: called in the thread that serves clients, it gives the routes."""
+    """`Interface.extra_routes` takes it: called in the thread that serves clients, it gives the routes."""
 
     def __init__(self, viewing: PageData) -> None:
         self._viewing = viewing

@@ -196,7 +196,7 @@ class Node:
                     if name in client.followed:
                         client.say(self._make_line("update", "error_update", place))
 
-    async def _look_anew(self) -> StandState:
+    async def _refresh_state(self) -> StandState:
         state = (await self._bridge.get_fresh_snapshot()).state
         self._look()
         return state
@@ -219,7 +219,7 @@ class Node:
         """The answer; Refusal."""
         if self.is_stop(request):
             await self._perform(self._bridge.stop(WHO))
-            await self._look_anew()
+            await self._refresh_state()
             return self._make_done("done", request)
         match request.action:
             case "describe":
@@ -307,7 +307,7 @@ class Node:
         if module.drive is not None:
             now_ns = (await self._bridge.get_fresh_snapshot()).state.now_ns
             module.drive.order(target, began_ns if module.drive.is_read_after else now_ns)
-        await self._look_anew()
+        await self._refresh_state()
         return came.id if isinstance(came, QueuedRun) else None
 
     async def _perform(self, work: Awaitable[BaseModel]) -> BaseModel:
@@ -315,7 +315,7 @@ class Node:
         try:
             return await work
         except (StandError, NoAnswer) as error:
-            state = await self._look_anew()
+            state = await self._refresh_state()
             while isinstance(error, Conflict) and isinstance(error.__cause__, StandError):
                 error = error.__cause__
             found = next((name for kind, name in _CLASSES if isinstance(error, kind)), "Impossible")

@@ -1,7 +1,7 @@
 """From the operator's Ctrl-C, and from the guard's look at a value above its limit, to the heater confirmed off.
 
 A whole stand in real time against the simulator in a process of its own, heating, polled ten times as often as in a
-night, so that a trip finds the bus busy. Confirmed means: the relay driver has read the coil back. After
+session, so that a trip finds the bus busy. Confirmed means: the relay driver has read the coil back. After
 every trip the simulator is asked, too.
 """
 

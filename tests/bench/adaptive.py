@@ -1,9 +1,9 @@
-"""A night that decides against the fixed thermal cycle, on drawn cameras straight from physics: how long it takes, and
-what compensation leaves of the truth.
+"""A session that decides against the fixed thermal cycle, on drawn cameras straight from physics: how long it takes,
+and what compensation leaves of the truth.
 
 Wanted is the residual that is predicted after the fixed cycle of 18 h; the time to be compared is that of the cycle,
 the visits of held-out temperatures included. Both models are asked about the same held-out temperatures: at rest, 4 h
-at each; on a way that neither night has gone, 45 min at each; and on that of the fixed cycle, which its own model has
+at each; on a way that neither session has gone, 45 min at each; and on that of the fixed cycle, which its own model has
 seen and no other.
 """
 
@@ -57,7 +57,7 @@ WAYS = {
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """share: of the fixed cycle's time, %. as_good_after: by then the deciding night is as good as the fixed one at
+    """share: of the fixed cycle's time, %. as_good_after: by then the deciding session is as good as the fixed one at
     rest, %; it is looked at every sixth visit. fixed, deciding: what each leaves, by WAYS."""
 
     share: float
@@ -74,7 +74,7 @@ def figures(directory: Path) -> Iterator[Figure]:
             report_progress(f"known, camera {number}: {outcome}")
             found.append(outcome)
     shares = [one.share for one in found]
-    yield set_upper_goal(GOAL, make_absolute("a night that decides, of the fixed cycle's time, median", "%", shares))
+    yield set_upper_goal(GOAL, make_absolute("a session that decides, of the fixed cycle's time, median", "%", shares))
     yield set_upper_goal(LIMIT, make_absolute("  the slowest of the cameras", "%", [max(shares)]))
     as_good = [one.as_good_after for one in found if np.isfinite(one.as_good_after)]
     yield make_absolute(
@@ -89,7 +89,7 @@ def figures(directory: Path) -> Iterator[Figure]:
 def _list_residuals(where: str, fixed: list[Score], deciding: list[Score]) -> Iterator[Figure]:
     yield make_absolute(f"  held-out residual {where}, fixed cycle, median", "mpx RMS", [one.rms_mpx for one in fixed])
     own = [one.rms_mpx for one in deciding]
-    yield make_absolute("    the night that decides", "mpx RMS", own)
+    yield make_absolute("    the session that decides", "mpx RMS", own)
     ratios = [one / other.rms_mpx for one, other in zip(own, fixed, strict=True)]
     yield make_absolute("    over that of the fixed cycle, median of the cameras", "", ratios)
     yield make_absolute(
@@ -137,7 +137,7 @@ def compute_left_mpx(learned_from: DrawnSession, asked: DrawnSession) -> float:
 def record_adaptive_session(
     camera: Camera, seed: int, residual_px: float, asked: DrawnSession, fixed_mpx: float
 ) -> tuple[float, float, DrawnSession]:
-    """How long the cycle took, s, when it was as good as the fixed one, s, and the night."""
+    """How long the cycle took, s, when it was as good as the fixed one, s, and the session."""
     known = Known(residual_px=residual_px)
     steps: list[Step] = [begin_cycle(known, WAY_DEGC, HELD_OUT_DEGC, DWELL_S, 5, CaptureParameters())]
     parts, gone_s, as_good_s, degC, soak_s = [*warm_up(), *reference()], 0.0, np.inf, 24.0, 0.0

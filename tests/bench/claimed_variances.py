@@ -1,7 +1,8 @@
 """Claimed variances of marker centres against true errors: chi^2 per coordinate, 1 when they are honest.
 
 The worse of x and y, as chi^2 or its inverse. Two scenes, with discs of 17 and 10 px radius, of poses, seeds and angles
-of motion that nothing was chosen on. Where frames are said to be doubtful there is no goal: that is what is to be said.
+of motion that nothing was chosen on. Where frames are reported to be suspect there is no goal: that is what is to be
+reported.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ PICTURES: dict[str, Picture] = {
 
 
 def figures(directory: Path) -> list[Figure]:
-    """chi^2 of each kind of picture, blur included, and how many of its frames are said to be doubtful."""
+    """chi^2 of each kind of picture, blur included, and how many of its frames are reported to be suspect."""
     cv2.setNumThreads(1)
     lines: list[Figure] = []
     for size, scene in SCENES.items():
@@ -67,18 +68,18 @@ def figures(directory: Path) -> list[Figure]:
 
 
 def _count_false_alarms() -> Figure:
-    """Frames of noise alone, none of them in the lines above, that are said to be doubtful."""
+    """Frames of noise alone, none of them in the lines above, that are reported to be suspect."""
     target = load_target(find_packaged("targets", "paper-9x6"))
-    doubtful: list[bool] = []
+    suspect: list[bool] = []
     for number, (size, scene) in enumerate(SCENES.items()):
         report_progress(f"false alarms, discs of {size}")
         clean, first = render(scene), FIRST_SEED + 1000 * (number + 1)
         found = [
             detect(photograph_with_noise(scene, clean, seed), target) for seed in range(first, first + CLEAN_FRAMES)
         ]
-        doubtful += [detection.is_doubtful for detection in found]
+        suspect += [detection.is_suspect for detection in found]
     return set_upper_goal(
-        _FALSE_ALARMS, make_absolute(f"doubtful of {len(doubtful)} frames of noise alone", "", [mean(doubtful)])
+        _FALSE_ALARMS, make_absolute(f"suspect of {len(suspect)} frames of noise alone", "", [mean(suspect)])
     )
 
 
@@ -86,10 +87,10 @@ def _make_figure(name: str, scene: Scene, clean: Float, picture: Picture) -> Fig
     target = load_target(find_packaged("targets", "paper-9x6"))
     found = [detect(picture(scene, clean, FIRST_SEED + number), target) for number in range(FRAMES)]
     chi2 = _compute_chi2(found, compute_true_centres_px(scene))
-    doubtful = sum(detection.is_doubtful for detection in found)
-    reported = f" ({doubtful} of {FRAMES} frames doubtful)" if doubtful else ""
+    suspect = sum(detection.is_suspect for detection in found)
+    reported = f" ({suspect} of {FRAMES} frames suspect)" if suspect else ""
     figure = make_absolute(f"claimed variances, {name}{reported}", "chi^2", [max(*chi2, *(1 / chi2))])
-    return figure if doubtful > FRAMES / 2 else set_upper_goal(GOAL, figure)
+    return figure if suspect > FRAMES / 2 else set_upper_goal(GOAL, figure)
 
 
 def _compute_chi2(found: list[Detection], truth: Float) -> Float:

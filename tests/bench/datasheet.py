@@ -1,4 +1,4 @@
-"""Datasheets of drawn cameras: whether two nights agree within what each states, and whether the truth does."""
+"""Datasheets of drawn cameras: whether two sessions agree within what each states, and whether the truth does."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def figures(directory: Path) -> list[Figure]:
     agree: list[bool] = []
     true: list[bool] = []
     for number in range(CAMERAS):
-        report_progress(f"datasheet, two nights of drawn camera {number + 1} of {CAMERAS}")
+        report_progress(f"datasheet, two sessions of drawn camera {number + 1} of {CAMERAS}")
         one, other = (_make_sheet(_draw_camera(number), 100 * number + k) for k in (0, 1))
         for first, second in zip(one.quantities, other.quantities, strict=True):
             if math.isfinite(first.value) and math.isfinite(second.value):
@@ -34,7 +34,7 @@ def figures(directory: Path) -> list[Figure]:
             true.append(abs(known[key].value - truth) <= known[key].expanded)
     return [
         set_lower_goal(
-            93, make_absolute("datasheet: entries of two nights that agree", "%", [100 * float(np.mean(agree))])
+            93, make_absolute("datasheet: entries of two sessions that agree", "%", [100 * float(np.mean(agree))])
         ),
         make_absolute("  true coefficients at rest within U; 95 is right", "%", [100 * float(np.mean(true))]),
     ]

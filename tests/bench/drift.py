@@ -1,7 +1,7 @@
-"""The drift models against the noise-free truth: on nights of the simulated laboratory, of its cameras of
+"""The drift models against the noise-free truth: on sessions of the simulated laboratory, of its cameras of
 configs/optics, and of cameras drawn from published numbers.
 
-The laboratory's nights come from the physics of drivers/sim alone, without wires and images, with the noise that the
+The laboratory's sessions come from the physics of drivers/sim alone, without wires and images, with the noise that the
 marker fit has on its images (2.4 mpx) and a camera that tells its temperature in quarters of a degree. No form is to be
 changed in view of the cameras of configs/optics: numbers 200 to 202 of each preset.
 """
@@ -82,9 +82,9 @@ def _draw_camera(seed: int, *more: str) -> Camera:
 def _record_asked_session(
     camera: Camera, way_degC: Sequence[int], seed: int, place_mm: Float | None = None
 ) -> DrawnSession:
-    """Another night, of held-out temperatures alone."""
+    """Another session, of held-out temperatures alone."""
     parts = [*warm_up(), *reference(), *cycle(tuple(way_degC), tuple(way_degC))]
-    return record_session(camera, parts, seed, session_id="night-2", place_mm=place_mm)
+    return record_session(camera, parts, seed, session_id="session-2", place_mm=place_mm)
 
 
 def _compute_coverage(found: Sequence[Score]) -> float:
@@ -99,11 +99,11 @@ def _map_by_form(chosen: DriftModel) -> dict[str, DriftModel]:
 
 
 def _score_laboratory() -> Iterator[Figure]:
-    """At held-out temperatures and in warm-ups elsewhere: medians of several nights. The terms were chosen with nights
-    of seeds 1 to 4 in view."""
+    """At held-out temperatures and in warm-ups elsewhere: medians of several sessions. The terms were chosen with
+    sessions of seeds 1 to 4 in view."""
     found: dict[tuple[str, str, float | None], list[tuple[float, float]]] = {}
     for seed in (5, 6, 7, 8):
-        report_progress(f"drift, one night of each camera, seed {seed}")
+        report_progress(f"drift, one session of each camera, seed {seed}")
         for what, unit, goal, pair in _score_seed(seed):
             found.setdefault((what, unit, goal), []).append(pair)
     for (what, unit, goal), pairs in found.items():
@@ -131,7 +131,7 @@ def _score_seed(seed: int) -> Iterator[tuple[str, str, float | None, tuple[float
 
 
 PRESETS, NUMBERS = ("nac", "navcam", "dic", "phone"), range(200, 203)
-HELD_OUT, SWITCHED_ON = "held-out temperatures", "switching on, another night"
+HELD_OUT, SWITCHED_ON = "held-out temperatures", "switching on, another session"
 GOAL_MPX = {"what repeats": {HELD_OUT: 5.0, SWITCHED_ON: 6.4}, "and what does not": {HELD_OUT: 10.0}}
 REPEATING: tuple[Effect, ...] = ("sag", "dead_zone", "creep", "coarse_sensor", "far_air")
 UNREPEATING: tuple[Effect, ...] = ("stick_slip", "unrepeated")
@@ -149,7 +149,7 @@ def _iterate_published(group: str) -> Iterator[Published]:
 
 
 def _score_presets() -> Iterator[Figure]:
-    """Medians of the cameras at held-out temperatures and when switched on at 20 degC on another night, and how often
+    """Medians of the cameras at held-out temperatures and when switched on at 20 degC on another session, and how often
     the 95 % intervals of the answers without a flag hold."""
     for group, goals_mpx in GOAL_MPX.items():
         found: dict[str, list[tuple[Score, Score, bool]]] = {HELD_OUT: [], SWITCHED_ON: []}
@@ -157,7 +157,7 @@ def _score_presets() -> Iterator[Figure]:
             report_progress(f"drift, {camera.preset} {camera.drawn}, {', '.join(camera.effects)}")
             first = DrawnSession(*plant_sessions.record_plant_session(camera, camera.drawn, warm_up_and_cycles()))
             second = DrawnSession(
-                *plant_sessions.record_plant_session(camera, camera.drawn + 1000, ANOTHER_SESSION, "night-2")
+                *plant_sessions.record_plant_session(camera, camera.drawn + 1000, ANOTHER_SESSION, "cycle-2")
             )
             model = fit(first.observed)
             paper = _map_by_form(model).get("paper", model)
@@ -215,7 +215,7 @@ def _score_moving_air() -> Iterator[Figure]:
 
 
 def _score_beyond_range() -> Iterator[Figure]:
-    """Asked beyond what was fitted, 17..45 degC, in another night: coverage of the 95 % interval, and how much of it
+    """Asked beyond what was fitted, 17..45 degC, in another session: coverage of the 95 % interval, and how much of it
     carries a flag."""
     fitted_degC = (27, 31, 34, 38, 41, 45, 41, 38, 34, 31, 27, 24, 20, 17, 20, 24)
     report_progress("drift, drawn cameras asked beyond what was fitted")
@@ -236,18 +236,18 @@ CLEAN_SESSIONS, BUMPED_SESSIONS = 300, 20
 
 
 def _score_bumps() -> Iterator[Figure]:
-    """How many bumps are found, how many where there are none, and what a fit leaves: nights without slips and fixings
-    that settle again, which are steps themselves and have a line of their own. The least gain of a bump was chosen on
-    nights from 1000 on."""
-    report_progress(f"drift, {CLEAN_SESSIONS} nights without a bump")
-    nights = (record_drawn_session(500 + seed, unrepeating=False) for seed in range(CLEAN_SESSIONS))
-    false = sum(bool(find_bumps(made.observed)) for made in nights)
+    """How many bumps are found, how many where there are none, and what a fit leaves: sessions without slips and
+    fixings that settle again, which are steps themselves and have a line of their own. The least gain of a bump was
+    chosen on sessions from 1000 on."""
+    report_progress(f"drift, {CLEAN_SESSIONS} sessions without a bump")
+    sessions = (record_drawn_session(500 + seed, unrepeating=False) for seed in range(CLEAN_SESSIONS))
+    false = sum(bool(find_bumps(made.observed)) for made in sessions)
     yield set_upper_goal(
-        1, make_absolute("drift, nights with a bump that was none", "%", [100 * false / CLEAN_SESSIONS])
+        1, make_absolute("drift, sessions with a bump that was none", "%", [100 * false / CLEAN_SESSIONS])
     )
     slips = [seed for seed in range(60) if "stick_slip" in draw_effects(seed, unrepeating=True)[0]][:BUMPED_SESSIONS]
     counts = [len(find_bumps(record_drawn_session(seed, unrepeating=True).observed)) for seed in slips]
-    yield make_absolute("  steps found a night in cameras that slip", "", [float(np.mean(counts))])
+    yield make_absolute("  steps found a session in cameras that slip", "", [float(np.mean(counts))])
     for size_px in (0.05, 0.1, 0.3):
         report_progress(f"drift, bumps of {size_px} px")
         found, bumped, clean = 0, [], []
@@ -258,19 +258,19 @@ def _score_bumps() -> Iterator[Figure]:
             clean.append(_score_clean_mpx(seed))
         share = 100 * found / BUMPED_SESSIONS
         yield set_lower_goal(100, make_absolute(f"drift, bumps of {size_px:g} px that are found", "%", [share]))
-        left = compare("  residual of the truth after it", "mpx RMS", "the same night without", bumped, clean)
+        left = compare("  residual of the truth after it", "mpx RMS", "the same session without", bumped, clean)
         yield set_upper_goal(1.5 * float(np.median(clean)), left)
 
 
 @cache
 def _score_clean_mpx(seed: int) -> float:
-    """What is left in the same night without a bump."""
+    """What is left in the same session without a bump."""
     made = record_session(_draw_camera(seed), make_full_session(), seed)
     return score(fit(made.observed, form="thermal"), made).rms_mpx
 
 
 def _score_bumped(seed: int, size_px: float) -> tuple[bool, float]:
-    """Whether a bump somewhere in the night is found where it was, to a dwell, and what is left then."""
+    """Whether a bump somewhere in the session is found where it was, to a dwell, and what is left then."""
     rng = np.random.default_rng([19, seed])
     at_h, angle = float(rng.uniform(6.5, 21.0)), rng.uniform(-np.pi, np.pi)
     bump = Bump(at_h, size_px * np.array([np.cos(angle), np.sin(angle)]))
@@ -282,7 +282,7 @@ def _score_bumped(seed: int, size_px: float) -> tuple[bool, float]:
 
 
 def _score_few_set_points(way_degC: tuple[int, ...]) -> Iterator[Figure]:
-    """With few set-points: which form is chosen, and what each leaves at others on another night."""
+    """With few set-points: which form is chosen, and what each leaves at others on another session."""
     report_progress(f"drift, drawn cameras with {len(way_degC)} visits")
     left: dict[str, list[float]] = {form: [] for form in FORMS}
     right, cameras = 0, range(2800, 2806)
@@ -300,15 +300,17 @@ def _score_few_set_points(way_degC: tuple[int, ...]) -> Iterator[Figure]:
 
 
 def _score_several_sessions() -> Figure:
-    """Two nights fitted together, asked about a third, beside fixings that settle again."""
-    report_progress("drift, drawn cameras with two nights")
+    """Two sessions fitted together, asked about a third, beside fixings that settle again."""
+    report_progress("drift, drawn cameras with two sessions")
     found = []
     for seed in range(2900, 2906):
         camera = _draw_camera(seed, "unrepeated")
-        nights = [record_session(camera, make_full_session(), 10 * seed + k, session_id=f"night-{k}") for k in range(3)]
-        model = fit_thermal(concatenate([one.observed for one in nights[:2]]))
-        found.append(score(model, nights[2]))
-    what = "drift, 95 % interval of two nights in a third, fixings settle again"
+        sessions = [
+            record_session(camera, make_full_session(), 10 * seed + k, session_id=f"session-{k}") for k in range(3)
+        ]
+        model = fit_thermal(concatenate([one.observed for one in sessions[:2]]))
+        found.append(score(model, sessions[2]))
+    what = "drift, 95 % interval of two sessions in a third, fixings settle again"
     return set_lower_goal(LEAST_COVERED, make_absolute(what, "%", [_compute_coverage(found)]))
 
 
@@ -319,8 +321,8 @@ _STEP = 1e-4
 
 def _score_in_space() -> Iterator[Figure]:
     """How far a target at V0..V3 seems to move in space, after compensation, while only the temperature did: on another
-    night, without the noise of the markers, with the camera's true calibration at the reference. RMS along the image's
-    axes and along the line of sight, um, of the target's middle; and of the markers, mpx."""
+    session, without the noise of the markers, with the camera's true calibration at the reference. RMS along the
+    image's axes and along the line of sight, um, of the target's middle; and of the markers, mpx."""
     report_progress("drift, V0..V3 in space, drawn cameras")
     found: dict[str, list[Float]] = {form: [] for form in FORMS}
     for seed in range(3300, 3310):
@@ -334,13 +336,13 @@ def _score_in_space() -> Iterator[Figure]:
             found[form].append(np.sqrt(np.mean(np.concatenate(each) ** 2, axis=0)))
     thermal, paper = (np.array(found[form]).T.tolist() for form in ("thermal", "paper"))
     for axis, (name, goal_um) in enumerate((("x", 1.0), ("y", 2.0), ("z", 5.0))):
-        what = f"drift, V0..V3 on another night, along {name}"
+        what = f"drift, V0..V3 on another session, along {name}"
         yield set_upper_goal(goal_um, compare(what, "um RMS", PEER, thermal[axis], paper[axis]))
     yield compare("  in the image", "mpx RMS", PEER, thermal[3], paper[3])
 
 
 def _compute_motion(model: DriftModel, made: DrawnSession, place_mm: Float) -> Float:
-    """(F, 4): of each held-out frame how far the target's middle seems to be from where it is at the night's own
+    """(F, 4): of each held-out frame how far the target's middle seems to be from where it is at the session's own
     reference, um, and RMS of the markers, mpx."""
     observed, truth = made.observed, made.truth_px
     states = compute_frame_states(observed, model.memory)
@@ -373,8 +375,8 @@ def _project_px(place_mm: Float) -> Float:
 
 
 def _score_units() -> Iterator[Figure]:
-    """A new unit of a camera type, seen at two temperatures, with what six other units have shown, on another night:
-    beside a model of the unit's own whole night."""
+    """A new unit of a camera type, seen at two temperatures, with what six other units have shown, on another session:
+    beside a model of the unit's own whole session."""
     report_progress("drift, new units of drawn types")
     found, whole = [], []
     for seed in range(7800, 7810):
@@ -388,6 +390,6 @@ def _score_units() -> Iterator[Figure]:
         found.append(score(fit_like(seen.observed, units), asked))
         whole.append(score(fit_thermal(record_session(new, make_full_session(), own).observed), asked).rms_mpx)
     what = "drift, a new unit of a known type from two temperatures"
-    left = compare(what, "mpx RMS", "its whole night", [one.rms_mpx for one in found], whole)
+    left = compare(what, "mpx RMS", "its whole session", [one.rms_mpx for one in found], whole)
     yield set_upper_ratio_goal(1.5, left)
     yield set_lower_goal(LEAST_COVERED, make_absolute("  95 % interval", "%", [_compute_coverage(found)]))

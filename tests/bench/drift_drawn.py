@@ -1,4 +1,4 @@
-"""The drift models on nights of cameras drawn from published numbers, against the noise-free truth."""
+"""The drift models on sessions of cameras drawn from published numbers, against the noise-free truth."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ class Score:
 
 
 def draw_effects(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
-    """What this camera has, and how its night begins: with a recorded warm-up, with switching it on, or after that."""
+    """What this camera has, and how its session begins: with a recorded warm-up, with switching it on, or after
+    that."""
     rng = np.random.default_rng([18, seed])
     names = [name for name in REPEATING if rng.random() < _CHANCE]
     begin = str(rng.choice(["warm up", "switched on", "unseen"], p=[0.6, 0.2, 0.2]))

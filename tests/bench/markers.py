@@ -136,8 +136,8 @@ def _measure_times(images: list[Image], target: Target, peers: dict[str, Peer]) 
                 lambda search=search: measure_processor_ms(lambda: search(images[1])),
                 ROUNDS,
             )
-            beside = compare(f"markers, {what} 5 MP frame, one core", "ms", peer, own, other)
-            lines.append(set_upper_ratio_goal(0.1, beside) if peer == COMMON and before is None else beside)
+            comparison = compare(f"markers, {what} 5 MP frame, one core", "ms", peer, own, other)
+            lines.append(set_upper_ratio_goal(0.1, comparison) if peer == COMMON and before is None else comparison)
     return lines
 
 
@@ -168,7 +168,7 @@ def _score_discs(name: str, case: Case, found: list[Detection], target: Target) 
 
 
 def _score_flags(name: str, found: list[Detection], truth: Float) -> list[Figure]:
-    """How many markers are flagged and refitted, and how far one is off that is said to be right."""
+    """How many markers are flagged and refitted, and how far one is off that is reported to be right."""
     flags = np.concatenate([detection.flags for detection in found])
     error = np.concatenate([_select_usable(detection) - truth for detection in found])
     seen = np.isfinite(error[:, 0])

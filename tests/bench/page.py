@@ -1,8 +1,8 @@
-"""What the page costs: memory of a page that lives through a night, how soon curves are answered, what viewers take.
+"""What the page costs: memory of a page that lives through a session, how soon curves are answered, what viewers take.
 
-A night of 24 h, all that is polled, is published as fast as it goes while the page is open at 24 h of curves. Then two
-viewers follow a stand that takes two frames a second; what they cost is the daemon's processor time with them less that
-without. Markers are looked for by another process, whose time is given apart.
+A session of 24 h, all that is polled, is published as fast as it goes while the page is open at 24 h of curves. Then
+two viewers follow a stand that takes two frames a second; what they cost is the daemon's processor time with them less
+that without. Markers are looked for by another process, whose time is given apart.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ async def _figures(directory: Path) -> list[Figure]:
 
 
 async def _measure_long_page(desk: CycleService, chromium: Any, port: int) -> list[Figure]:
-    report_progress("a page open for 24 h of a replayed night")
+    report_progress("a page open for 24 h of a replayed session")
     async with a_page(chromium, port) as page:
         await page.get_by_role("button", name="24 h").click()
         await page.wait_for_timeout(3000)
@@ -72,7 +72,7 @@ async def _measure_long_page(desk: CycleService, chromium: Any, port: int) -> li
     peer = f"{before_MB:.1f} MB at first, {seen_MB[-1]:.1f} MB at the end"
     reported = f"p99 of {ASKED}; median {statistics.median(answers_ms):.1f} ms"
     return [
-        set_upper_goal(100, Figure("page open for 24 h of a night, heap in use at most", "MB", max(seen_MB), peer)),
+        set_upper_goal(100, Figure("page open for 24 h of a session, heap in use at most", "MB", max(seen_MB), peer)),
         set_upper_goal(
             50,
             compare_with_waiting(

@@ -63,7 +63,7 @@ def _in_band(image: Image, target: Target, found: Detection, band_sigma: float) 
     """The centres as a frame after `found` has them in another band."""
     before = Detection(
         found.centres_px, found.covariance_px2, found.flags, found.chi, found.homography, found.state,
-        found.growth, found.excess_px2, band_sigma, found.is_doubtful,
+        found.growth, found.excess_px2, band_sigma, found.is_suspect,
     )  # fmt: skip
     return detect(image, target, before).centres_px
 

@@ -1,7 +1,7 @@
-"""What it costs to look into a session: one frame, or all temperatures, of 1 GB, of 5 GB and of a night.
+"""What it costs to look into a session: one frame, or all temperatures, of 1 GB, of 5 GB and of a session.
 
 The sessions are written by the recorder's own series: raw frames of 5 MP at 2 per second in segments of 1 GB, telemetry
-of seven devices each second; the night is 16 h of telemetry alone. The one of 1 GB is the first segment of the other.
+of seven devices each second; the session is 16 h of telemetry alone. The one of 1 GB is the first segment of the other.
 The peer does the same with mcap's own reader, CRCs checked as ours are. All files are in the page cache.
 """
 
@@ -51,7 +51,7 @@ FRAME_PERIOD_NS = NS_PER_S // 2
 HEIGHT_px, WIDTH_px = 2048, 2448
 FRAMES_PER_SEGMENT = 200  # 1.0 GB
 SEGMENTS = 5
-NIGHT_s = 16 * 3600
+SESSION_s = 16 * 3600
 TEMPERATURES = tuple(f"thermometers.{place}" for place in PLACES)
 TEMPERATURE_FIELDS = tuple(f"{place}_degC" for place in PLACES)
 METADATA = {"format": str(FORMAT), "session_id": "bench"}
@@ -60,16 +60,16 @@ ATTACHMENTS = {"config.yaml": "a: 1\n" * 400}
 
 def figures(directory: Path) -> list[Figure]:
     """ms for a random frame and for all temperatures, each beside mcap's reader, and how both grow with the size."""
-    small, large, night = (directory / name for name in ("1GB", "5GB", "night"))
+    small, large, long = (directory / name for name in ("1GB", "5GB", "cycle"))
     try:
-        _write_sessions(small, large, night)
-        return [*_frame_figures(small, large), *_temperature_figures(small, large, night)]
+        _write_sessions(small, large, long)
+        return [*_frame_figures(small, large), *_temperature_figures(small, large, long)]
     finally:
-        for session in (small, large, night):
+        for session in (small, large, long):
             shutil.rmtree(session, ignore_errors=True)
 
 
-def _write_sessions(small: Path, large: Path, night: Path) -> None:
+def _write_sessions(small: Path, large: Path, long: Path) -> None:
     report_progress("reading, 5 GB of frames are written")
     _write_frames(large)
     write_telemetry(large, SEGMENTS * FRAMES_PER_SEGMENT // 2)
@@ -77,7 +77,7 @@ def _write_sessions(small: Path, large: Path, night: Path) -> None:
     os.link(large / FRAMES / "0000.mcap", small / FRAMES / "0000.mcap")
     write_telemetry(small, FRAMES_PER_SEGMENT // 2)
     report_progress("reading, 16 h of telemetry are written")
-    write_telemetry(night, NIGHT_s)
+    write_telemetry(long, SESSION_s)
 
 
 def _series(folder: Path, topics: tuple[Topic, ...], compression: CompressionType, segment_bytes: int) -> Series:
@@ -217,7 +217,7 @@ def _peer_table(session: Path) -> object:
     return list(map(messages.decode_frame_meta, found))
 
 
-def _temperature_figures(small: Path, large: Path, night: Path) -> list[Figure]:
+def _temperature_figures(small: Path, large: Path, long: Path) -> list[Figure]:
     report_progress("reading, temperatures")
     found = [
         compare(
@@ -226,7 +226,7 @@ def _temperature_figures(small: Path, large: Path, night: Path) -> list[Figure]:
             "mcap make_reader, CRCs, protobuf",
             *measure_in_turns(_timed(_own_temperatures, path), _timed(_peer_temperatures, path), rounds),
         )
-        for what, path, rounds in (("5 GB", large, 20), ("16 h", night, 5))
+        for what, path, rounds in (("5 GB", large, 20), ("16 h", long, 5))
     ]
     found[0] = set_upper_goal(100, found[0])
     return [*found, make_absolute("reading, 5 GB: open", "ms", [_timed(Session.open, large)() for _ in range(ROUNDS)])]

@@ -55,7 +55,7 @@ asyncio.run(run())
 
 def figures(directory: Path) -> list[Figure]:
     """99th percentiles alone and beside viewers, the longest of some beside each flood, ms."""
-    session = directory / "night"
+    session = directory / "cycle"
     session.mkdir()
     found: list[Figure] = []
     with _run_daemon(session) as ports:
@@ -77,14 +77,14 @@ def figures(directory: Path) -> list[Figure]:
     return found
 
 
-def _measure_ways(ways: dict[str, Server], beside_what: str) -> list[Figure]:
+def _measure_ways(ways: dict[str, Server], load: str) -> list[Figure]:
     found: list[Figure] = []
     for way, server in ways.items():
-        report_progress(f"STOP {way}, {STOPS} times, {beside_what}")
+        report_progress(f"STOP {way}, {STOPS} times, {load}")
         with run_waiting_process() as waited_ms:
             times_ms = [_stop_ms(server) for _ in range(STOPS)]
         seen = f"p99 of {STOPS}; median {sorted(times_ms)[STOPS // 2]:.1f}, longest {max(times_ms):.1f} ms"
-        figure = Figure(f"STOP {way} to its answer, {beside_what}", "ms", compute_p99(times_ms), seen)
+        figure = Figure(f"STOP {way} to its answer, {load}", "ms", compute_p99(times_ms), seen)
         found.append(set_upper_goal(LIMIT_ms, compare_with_waiting(figure, waited_ms)))
     return found
 

@@ -1,5 +1,6 @@
-"""`make benchmark`: methods of compensation on nights of drawn cameras, against the truth. `python -m tests.benchmark
-my_method.py` scores one more; `--cameras 3` takes fewer of them; `--write FOLDER` writes the nights for other programs.
+"""`make benchmark`: methods of compensation on sessions of drawn cameras, against the truth. `python -m tests.benchmark
+my_method.py` scores one more; `--cameras 3` takes fewer of them; `--write FOLDER` writes the sessions for other
+programs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmark", description=__doc__)
     parser.add_argument("method", nargs="*", type=Path, help="files with NAME and fit(training)")
     parser.add_argument("--cameras", type=int, default=CAMERAS, help="of each group")
-    parser.add_argument("--write", type=Path, metavar="FOLDER", help="the nights as .npz files, and no scores")
+    parser.add_argument("--write", type=Path, metavar="FOLDER", help="the sessions as .npz files, and no scores")
     given = parser.parse_args()
     if given.write is not None:
         for way, group, number in product(TRAININGS, GROUPS, range(given.cameras)):
@@ -56,7 +57,10 @@ def write(one: Case, folder: Path) -> None:
     """Two files for each camera: what may be learned from, and for each task what is asked, with the answer."""
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{TRAININGS.index(one.learned_from)}-{GROUPS.index(one.group)}-{one.camera:02d}"
-    for part, known in (("training", one.training), *((f"task-{k}", q.night) for k, q in enumerate(one.questions, 1))):
+    for part, known in (
+        ("training", one.training),
+        *((f"task-{k}", q.session) for k, q in enumerate(one.questions, 1)),
+    ):
         history = known.histories[0]
         columns = {key: getattr(known, key) for key in ("time_ns", "role", "chamber_degC", "camera_degC", "air_degC")}
         telemetry = {key: getattr(history, key) for key in ("ambient_ns", "ambient_degC", "powered_ns", "powered")}

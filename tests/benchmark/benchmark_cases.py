@@ -1,5 +1,5 @@
-"""The nights of the public benchmark: cameras drawn from published numbers, one night to learn from and others to be
-asked about, with the noise-free truth.
+"""The sessions of the public benchmark: cameras drawn from published numbers, one session to learn from and others to
+be asked about, with the noise-free truth.
 
 Numbers of cameras begin at 1000: no method of this project was made with these cameras in view. Everything is computed
 on the spot, the same on every run.
@@ -30,7 +30,7 @@ Float = NDArray[np.float64]
 TRAININGS = ("frames at rest", "frames on the way as well")
 """What is learned from: a warm-up, and frames at the end of each dwell; or one every two minutes on the way, too."""
 GROUPS = ("what repeats", "and what does not")
-TASKS = ("held-out temperatures", "switching on, another night", "small steps, never at rest", "air that jumps")
+TASKS = ("held-out temperatures", "switching on, another session", "small steps, never at rest", "air that jumps")
 FIRST, CAMERAS = 1000, 20
 HELD_OUT = "held out"
 _CHANCE = 0.4
@@ -41,12 +41,12 @@ _STEP_S, _JUMP_S = 960, 1500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """One task of one camera: which frames (K,) of a night, what is seen in them (K, N, 2), px, without noise, and
-    where it was at the reference of the night to learn from (N, 2): camera and target have not been touched in between.
-    night: what is known about it; the centres of these frames are not."""
+    """One task of one camera: which frames (K,) of a session, what is seen in them (K, N, 2), px, without noise, and
+    where it was at the reference of the session to learn from (N, 2): camera and target have not been touched in
+    between. session: what is known about it; the centres of these frames are not."""
 
     task: str
-    night: Observations
+    session: Observations
     frames: NDArray[np.int64]
     seen_px: Float
     reference_px: Float
@@ -54,7 +54,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One camera. learned_from: of TRAININGS. training: the night to learn from, without the centres of the frames
+    """One camera. learned_from: of TRAININGS. training: the session to learn from, without the centres of the frames
     that are asked for."""
 
     group: str
@@ -73,10 +73,10 @@ def make_case(group: str, number: int, learned_from: str = TRAININGS[0]) -> Case
         effects.append(UNREPEATING[rng.integers(2)])
     camera = draw_camera(seed, *effects)
     parts = make_full_session() if learned_from == TRAININGS[0] else [*warm_up(), *reference(), *make_followed_cycle()]
-    first = record_session(camera, parts, seed, session_id="night-1")
+    first = record_session(camera, parts, seed, session_id="session-1")
     begin = [*warm_up(20.0), *reference()]
-    second = record_session(camera, [*begin, *_make_drive(_STEPS_DEGC, _STEP_S)], seed + 10_000, session_id="night-2")
-    third = record_session(camera, [*begin, *_make_drive(_JUMPS_DEGC, _JUMP_S)], seed + 20_000, session_id="night-3")
+    second = record_session(camera, [*begin, *_make_drive(_STEPS_DEGC, _STEP_S)], seed + 10_000, session_id="session-2")
+    third = record_session(camera, [*begin, *_make_drive(_JUMPS_DEGC, _JUMP_S)], seed + 20_000, session_id="session-3")
     at_reference = first.truth_px[first.observed.of(Role.REFERENCE)].mean(axis=0)
     held_out, steps, jumps = (_hide_role(made, Role.VALIDATION) for made in (first, second, third))
     switched_on = _hide_role(second, Role.WARM_UP)
@@ -105,7 +105,7 @@ def _make_question(task: str, made: DrawnSession, known: Observations, role: str
 
 
 def _hide_role(made: DrawnSession, role: str) -> Observations:
-    """Without the centres of the frames of this role, which are said to be unusable."""
+    """Without the centres of the frames of this role, which are reported to be unusable."""
     observed = made.observed
     asked = observed.of(role)
     centres, covariance = observed.centres_px.copy(), observed.covariance_px2.copy()

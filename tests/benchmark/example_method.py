@@ -14,7 +14,7 @@ NAME = "a table of affine motions"
 
 
 def fit(training: Observations) -> Corrector:
-    """Learns from the reference and fit frames of one night."""
+    """Learns from the reference and fit frames of one session."""
     reference_px = training.centres_px[training.of("reference")].mean(axis=0)
     frames = np.flatnonzero(training.of("reference", "fit"))
     degC, motions = [], []
@@ -26,8 +26,8 @@ def fit(training: Observations) -> Corrector:
     order = np.argsort(degC)
     table_degC, table = np.array(degC)[order], np.array(motions)[order].reshape(len(order), 6)
 
-    def corrected(night: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
-        own_degC = night.camera_degC[asked]
+    def corrected(session: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
+        own_degC = session.camera_degC[asked]
         motion = np.stack([np.interp(own_degC, table_degC, column) for column in table.T], axis=1).reshape(-1, 3, 2)
         return Correction(np.array([seen + _terms(seen) @ one for seen, one in zip(seen_px, motion, strict=True)]))
 

@@ -24,7 +24,7 @@ from .scoring import Correction, Corrector, Float, Method
 
 def nothing(training: Observations) -> Corrector:
     """What the camera does when nobody compensates."""
-    return lambda night, frames, seen_px: Correction(seen_px)
+    return lambda session, frames, seen_px: Correction(seen_px)
 
 
 def paper(training: Observations) -> Corrector:
@@ -46,9 +46,9 @@ def chosen(training: Observations) -> Corrector:
 def corrector(model: DriftModel) -> Corrector:
     """Of a fitted model."""
 
-    def corrected(night: Observations, frames: NDArray[np.int64], seen_px: Float) -> Correction:
-        states = compute_frame_states(night, model.memory)
-        asked = model.of_sessions(one.session_id for one in night.sessions)
+    def corrected(session: Observations, frames: NDArray[np.int64], seen_px: Float) -> Correction:
+        states = compute_frame_states(session, model.memory)
+        asked = model.of_sessions(one.session_id for one in session.sessions)
         places, sigma = np.empty_like(seen_px), np.empty_like(seen_px)
         inside = np.empty(seen_px.shape[:2], bool)
         for row, frame in enumerate(frames.tolist()):
@@ -77,9 +77,9 @@ def gp_on_residual(training: Observations) -> Corrector:
     gp = _Gp((at - middle) / spread, shift[known])
     plain = corrector(model)
 
-    def corrected(night: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
-        answer = plain(night, asked, seen_px)
-        wanted = (_inputs(compute_frame_states(night, model.memory))[asked] - middle) / spread
+    def corrected(session: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
+        answer = plain(session, asked, seen_px)
+        wanted = (_inputs(compute_frame_states(session, model.memory))[asked] - middle) / spread
         more, variance = gp.predicted(wanted)
         assert answer.sigma_px is not None
         sigma = np.sqrt(answer.sigma_px**2 + variance[:, None, None])

@@ -1,11 +1,11 @@
 """What a method of compensation is, and how it is scored.
 
-A method is a function that learns from one night and returns another one that corrects:
+A method is a function that learns from one session and returns another one that corrects:
 
     def fit(training: Observations) -> Corrector
     Corrector = Callable[[Observations, frames (K,), seen_px (K, N, 2)], Correction]
 
-The corrector has the recorded temperatures of the night that is asked about (`histories`, `camera_degC`, `air_degC`),
+The corrector has the recorded temperatures of the session that is asked about (`histories`, `camera_degC`, `air_degC`),
 and never the centres of the frames that are.
 """
 
@@ -64,7 +64,7 @@ def score_method(name: str, method: Method, case: Case) -> list[Score]:
     fit_s = time.perf_counter() - begin_s
     found: list[Score] = []
     for question in case.questions:
-        answer = corrector(question.night, question.frames, question.seen_px)
+        answer = corrector(question.session, question.frames, question.seen_px)
         left = answer.corrected_px - question.reference_px
         inside = np.ones(left.shape[:2], bool) if answer.inside is None else answer.inside
         covered = math.nan
@@ -107,8 +107,8 @@ def _format_cells(own: Sequence[Score]) -> list[str]:
         here = [score for score in own if score.task == task]
         values = [score.rms_mpx for score in here]
         stands_by = float(np.mean([score.inside for score in here]))
-        said = "" if stands_by == 1 else f"; {100 * stands_by:.0f} % inside"
-        cells.append(f"{np.median(values):.1f}, worst {max(values):.1f}{said}")
+        share = "" if stands_by == 1 else f"; {100 * stands_by:.0f} % inside"
+        cells.append(f"{np.median(values):.1f}, worst {max(values):.1f}{share}")
     covered = [(score.covered, score.inside) for score in own if not math.isnan(score.covered)]
     values, weights = zip(*covered, strict=True) if covered else ((), ())
     cells.append(f"{100 * float(np.average(values, weights=weights)):.1f} %" if covered else "none given")

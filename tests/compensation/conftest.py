@@ -172,7 +172,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """The session, not to be changed. The first worker that needs it records it for all."""
     folder = tmp_path_factory.getbasetemp().parent if WORKER in os.environ else tmp_path_factory.mktemp("sessions")
-    path, made = folder / "night", folder / "night is recorded"
+    path, made = folder / "cycle", folder / "session is recorded"
     with (folder / "recording").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not made.exists():

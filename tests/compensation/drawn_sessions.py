@@ -1,7 +1,7 @@
-"""Nights of drawn cameras: observations as a recording would give them, and the noise-free truth. Centres come straight
-from physics, without wires and images.
+"""Sessions of drawn cameras: observations as a recording would give them, and the noise-free truth. Centres come
+straight from physics, without wires and images.
 
-A night is a list of parts. The chamber follows its set-point in a few minutes, with an overshoot that dies out.
+A session is a list of parts. The chamber follows its set-point in a few minutes, with an overshoot that dies out.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def make_full_session(cycles: int = 1, *, with_warm_up: bool = True) -> list[Str
 
 
 def make_unseen_begin(air_degC: float = 20.0, seconds: int = 1800) -> list[Stretch]:
-    """For `night(unrecorded=)`: switched on in the room, half an hour before anybody records."""
+    """For `session(unrecorded=)`: switched on in the room, half an hour before anybody records."""
     return [Stretch(air_degC, 60, powered=False), Stretch(air_degC, seconds)]
 
 
@@ -114,7 +114,7 @@ def record_session(
     parts: Sequence[Stretch],
     seed: int = 0,
     bumps: Sequence[Bump] = (),
-    session_id: str = "night-1",
+    session_id: str = "cycle-1",
     noise_px: float = NOISE_PX,
     unrecorded: Sequence[Stretch] = (),
     place_mm: Float | None = None,

@@ -92,13 +92,13 @@ def draw_pose(name: str, seed: int, poses: dict[str, Scene] = SCENES) -> Scene:
     return framed
 
 
-def _fit_in_frame(scene: Scene, room: float, shift: Float) -> Scene:
-    """At `room` times the least distance that has every disc in the frame, moved within half of what is left."""
+def _fit_in_frame(scene: Scene, margin: float, shift: Float) -> Scene:
+    """At `margin` times the least distance that has every disc in the frame, moved within half of what is left."""
     distance_mm = scene.f_px * 50.0 / scene.size[0]
     while not _fits(replace(scene, distance_mm=distance_mm)):
         distance_mm *= 1.02
-    placed = replace(scene, distance_mm=distance_mm * room)
-    free_mm = (room - 1) / 2 * distance_mm * np.array(scene.size) / scene.f_px
+    placed = replace(scene, distance_mm=distance_mm * margin)
+    free_mm = (margin - 1) / 2 * distance_mm * np.array(scene.size) / scene.f_px
     for part in (0.5, 0.25, 0.0):
         moved = replace(placed, shift_mm=tuple(part * shift * free_mm))
         if _fits(moved):

@@ -30,7 +30,7 @@ FACTS = {
     "reference_centres_px": np.array([[100.0, 90.0], [np.nan, np.nan]]),
     "target_name": "small",
     "camera_serial": "TS-0001",
-    "session_ids": ("night",),
+    "session_ids": ("cycle",),
     "software_version": "0",
 }
 

@@ -1,6 +1,6 @@
-"""Nights of the simulated laboratory without its wires and images: its physics, thermometers and noise-free centres.
+"""Sessions of the simulated laboratory without its wires and images: its physics, thermometers and noise-free centres.
 
-A night is a list of things to do; what comes back are observations as a recording would give them, and the truth.
+A session is a list of things to do; what comes back are observations as a recording would give them, and the truth.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class PlantSession:
         self._plant.flap_open_at = lambda _: 0.0
 
     def perform(self, part: WarmUp | Dwell) -> None:
-        """One part of the night."""
+        """One part of the session."""
         self._target_degC = part.chamber_degC
         if isinstance(part, Dwell):
             self.wait(part.soak_s)
@@ -160,7 +160,7 @@ class PlantSession:
         air, powered, stated = (np.array(part) for part in (log.air, log.powered, log.camera))
         return Observations(
             target=TARGET,
-            sessions=(SessionFacts(session_id, "night", "TS-0001", "operator", "0.1.0", True, 0),),
+            sessions=(SessionFacts(session_id, "cycle", "TS-0001", "operator", "0.1.0", True, 0),),
             image_size=SIZE,
             preview=np.full((682, 816), 200, np.uint8),
             session=np.zeros(count, np.int64),

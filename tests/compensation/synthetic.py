@@ -23,7 +23,7 @@ FIT_DEGC = (10.0, 17.0, 24.0, 31.0, 38.0, 45.0, 52.0)
 HELD_OUT_DEGC = (14.0, 20.0, 27.0, 34.0, 41.0, 48.0)
 
 
-def facts(session_id: str = "night-1", camera: str = "TS-0001") -> SessionFacts:
+def facts(session_id: str = "cycle-1", camera: str = "TS-0001") -> SessionFacts:
     return SessionFacts(session_id, "thermal-cycle", camera, "operator", "0.1.0", None, 0)
 
 

@@ -36,7 +36,7 @@ def model(first: DrawnSession) -> ThermalModel:
 
 
 def moved(away_px: float) -> DrawnSession:
-    """Another night; before it the target was put back with a shift of the image, and a turn of 50 urad."""
+    """Another session; before it the target was put back with a shift of the image, and a turn of 50 urad."""
     made = record_session(draw_camera(SEED), [*warm_up(), *reference(), *cycle(ASKED_DEGC, ASKED_DEGC)], SEED + 1)
     middle = made.truth_px - made.truth_px.mean(axis=(0, 1))
     shift = away_px * np.array([0.8, -0.6]) + 5e-5 * middle[:, :, ::-1] * np.array([-1.0, 1.0])
@@ -44,7 +44,7 @@ def moved(away_px: float) -> DrawnSession:
 
 
 def left(model: ThermalModel, first: DrawnSession, asked: DrawnSession) -> tuple[Float, Float]:
-    """Deviations (F, 54, 2) of the corrected truth from the first night's reference, and the variance claimed."""
+    """Deviations (F, 54, 2) of the corrected truth from the first session's reference, and the variance claimed."""
     at_reference_px = first.truth_px[first.observed.of(Role.REFERENCE)].mean(axis=0)
     states = compute_frame_states(asked.observed, model.memory)
     frames = np.flatnonzero(asked.observed.of(Role.VALIDATION)).tolist()

@@ -156,7 +156,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
     )
 
 
-def test_a_folder_that_is_there_is_not_written_into(recorded: Recorded, files: dict[str, Path], tmp_path: Path):
+def test_an_existing_folder_is_not_written_into(recorded: Recorded, files: dict[str, Path], tmp_path: Path):
     (tmp_path / "there").mkdir()
     assert "a new folder" in run("apply", files["paper"], recorded.path, "-o", tmp_path / "there", status=1)
     assert not list((tmp_path / "there").iterdir())
@@ -206,8 +206,8 @@ def test_a_model_is_anchored_in_a_session_by_its_reference_frames(
     place = tmp_path / "place.csv"
     place.write_text(f"x_px,y_px,time_ns\n100,200,{observed.time_ns[4]}\n")
     for name, is_offered in (("elsewhere", True), ("here", False)):
-        said = run("apply", tmp_path / f"{name}.json", place, "--session", recorded.path, "-o", tmp_path / "out.csv")
-        assert ("`compensate rereference`" in said) == is_offered
+        answer = run("apply", tmp_path / f"{name}.json", place, "--session", recorded.path, "-o", tmp_path / "out.csv")
+        assert ("`compensate rereference`" in answer) == is_offered
     refused = run("rereference", files["paper"], recorded.path, "-o", tmp_path / "none.json", status=1)
     assert "no thermal form" in refused
     few = "fit", recorded.path, *2 * ["--like", files["thermal"]], "-o", tmp_path / "none.json"
@@ -222,8 +222,8 @@ def test_a_session_is_corrected_with_the_form_in_use_and_so_is_an_export(
     run("detect", recorded.path, "-o", tmp_path / "found.csv")
     for name in ("both", "thermal"):
         model = tmp_path / f"{name}.json"
-        said = run("apply", model, tmp_path / "found.csv", "--session", recorded.path, "-o", tmp_path / f"{name}.csv")
-        assert "the thermal form" in said
+        answer = run("apply", model, tmp_path / "found.csv", "--session", recorded.path, "-o", tmp_path / f"{name}.csv")
+        assert "the thermal form" in answer
         run("export", model, "-o", tmp_path / name)
     assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "thermal.csv").read_bytes()
     assert (tmp_path / "both" / "drift.json").read_bytes() == (tmp_path / "thermal" / "drift.json").read_bytes()

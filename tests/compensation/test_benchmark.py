@@ -27,8 +27,8 @@ def test_the_frames_that_are_asked_for_have_no_centres_and_the_truth_no_noise(on
     assert not one.training.of("validation").any()
     for question in one.questions:
         assert len(question.frames) >= 30
-        assert np.isnan(question.night.centres_px[question.frames]).all()
-        assert not question.night.usable[question.frames].any()
+        assert np.isnan(question.session.centres_px[question.frames]).all()
+        assert not question.session.usable[question.frames].any()
         assert np.isfinite(question.seen_px).all()
         assert 0.01 < np.abs(question.seen_px - question.reference_px).max() < 3
     known = one.training.of("reference")
@@ -63,12 +63,12 @@ def test_a_method_answers_and_one_with_intervals_says_them(one: Case, name: str)
         assert found[0].rms_mpx < 15
 
 
-def test_the_nights_can_be_written_for_other_programs(one: Case, tmp_path: Path):
-    write(one, tmp_path / "nights")
-    names = {path.name for path in (tmp_path / "nights").iterdir()}
+def test_the_sessions_can_be_written_for_other_programs(one: Case, tmp_path: Path):
+    write(one, tmp_path / "cycles")
+    names = {path.name for path in (tmp_path / "cycles").iterdir()}
     assert {"1-1-00-training.npz", "1-1-00-task-4.npz", "1-1-00-answers.npz"} <= names
-    training = np.load(tmp_path / "nights" / "1-1-00-training.npz")
+    training = np.load(tmp_path / "cycles" / "1-1-00-training.npz")
     assert np.isnan(training["centres_px"][training["role"] == "validation"]).all()
-    answers = np.load(tmp_path / "nights" / "1-1-00-answers.npz")
+    answers = np.load(tmp_path / "cycles" / "1-1-00-answers.npz")
     np.testing.assert_array_equal(answers["task_2_seen_px"], one.questions[1].seen_px)
-    assert sum(path.stat().st_size for path in (tmp_path / "nights").iterdir()) * 80 < 2e9
+    assert sum(path.stat().st_size for path in (tmp_path / "cycles").iterdir()) * 80 < 2e9

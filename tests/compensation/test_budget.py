@@ -199,9 +199,9 @@ def published(number: int, time_ns: int) -> Iterator[Item]:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("sessions") / "night"
+    path = tmp_path_factory.mktemp("sessions") / "cycle"
     attachments = {"target.yaml": find_packaged("targets", "paper-9x6").read_text()}
-    how = {"session_id": "night", "recipe": "validation", "attachments": attachments}
+    how = {"session_id": "cycle", "recipe": "validation", "attachments": attachments}
     asyncio.run(record_items(path, published, 2 * len(CAPTURES), 30, **how))
     return path
 

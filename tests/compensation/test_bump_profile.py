@@ -1,6 +1,6 @@
-"""Three hundred clean nights with at most three steps that are none, and steps of a twentieth of a pixel in every third
-of them. A hundred of the simulated laboratory, two hundred of drawn cameras, half of these with frames on the way:
-centres straight from physics. No threshold was chosen on nights of these numbers."""
+"""Three hundred clean sessions with at most three steps that are none, and steps of a twentieth of a pixel in every
+third of them. A hundred of the simulated laboratory, two hundred of drawn cameras, half of these with frames on the
+way: centres straight from physics. No threshold was chosen on sessions of these numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thermostand.compensation.drift.model_facts import Bump
 from thermostand.compensation.observations import Observations
 from thermostand.experiments.steps import Role
 
-FIRST, NIGHTS = 70_000, 100
+FIRST, SESSIONS = 70_000, 100
 MOST_FALSE = 3
 LEAST_FOUND = 95
 SIZE_PX = 0.05
@@ -56,24 +56,24 @@ def bumped(clean: Observations, seed: int) -> tuple[Observations, int]:
     return replace(clean, centres_px=clean.centres_px + later[:, None, None] * shift), at_ns
 
 
-def is_there(found: tuple[Bump, ...], at_ns: int) -> bool:
+def is_found(found: tuple[Bump, ...], at_ns: int) -> bool:
     return any(one.after_ns - _NEAR_NS < at_ns < one.before_ns + _NEAR_NS for one in found)
 
 
 @pytest.mark.nightly
-def test_three_hundred_clean_nights_and_a_hundred_bumps() -> None:
+def test_three_hundred_clean_sessions_and_a_hundred_bumps() -> None:
     kinds: tuple[Callable[[int], Observations], ...] = (laboratory, at_rest, on_the_way)
     false: list[tuple[str, int]] = []
     missed: list[tuple[str, int]] = []
     for kind in kinds:
-        for number in range(NIGHTS):
+        for number in range(SESSIONS):
             clean = kind(FIRST + number)
             if find_bumps(clean):
                 false.append((kind.__name__, FIRST + number))
             if number % len(kinds) == 0:
                 made, at_ns = bumped(clean, number)
-                if not is_there(find_bumps(made), at_ns):
+                if not is_found(find_bumps(made), at_ns):
                     missed.append((kind.__name__, FIRST + number))
-    tried = len(kinds) * len(range(0, NIGHTS, len(kinds)))
+    tried = len(kinds) * len(range(0, SESSIONS, len(kinds)))
     assert len(false) <= MOST_FALSE, false
     assert 100 * (1 - len(missed) / tried) >= LEAST_FOUND, missed

@@ -1,4 +1,4 @@
-"""Steps in a night: found where they are, with their size, and fitted around; none in nights without any."""
+"""Steps in a session: found where they are, with their size, and fitted around; none in sessions without any."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_bump_of_a_twentieth_of_a_pixel_is_found_when_and_how_far(seed: int) -
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_clean_night_has_none(seed: int) -> None:
+def test_a_clean_session_has_none(seed: int) -> None:
     effects = ("creep", "coarse_sensor") if seed % 2 else ("sag", "far_air")
     assert find_bumps(record_session(draw_camera(seed, *effects), make_full_session(), seed).observed) == ()
 
@@ -98,7 +98,7 @@ def test_the_fit_goes_around_a_bump() -> None:
     assert np.hypot(*scored[1]) < 1.5 * np.hypot(*scored[0])
 
 
-def test_a_bump_before_the_reference_moves_the_warm_up_not_the_night() -> None:
+def test_a_bump_before_the_reference_moves_the_warm_up_not_the_session() -> None:
     camera = draw_camera(2)
     made = record_session(camera, make_full_session(), bumps=[Bump(4.6, np.array([0.2, 0.1]))])
     model = fit(made.observed, form="thermal")

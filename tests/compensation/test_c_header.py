@@ -76,7 +76,7 @@ def test_it_corrects_and_flags_as_the_module_at_every_instant(name: str, program
 
 
 @pytest.mark.nightly
-def test_a_fitted_model_follows_a_whole_night_as_the_module_does(tmp_path: Path):
+def test_a_fitted_model_follows_a_whole_session_as_the_module_does(tmp_path: Path):
     made = record_session(draw_camera(1003, "creep", "dead_zone"), make_full_session())
     model, history = fit(made.observed), made.observed.histories[0]
     since_s = (history.ambient_ns - history.ambient_ns[0]) / 1e9

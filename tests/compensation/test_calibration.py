@@ -131,9 +131,9 @@ def test_of_a_wide_lens_what_nobody_saw_and_rays_that_do_not_describe_it_are_not
     assert found.rays_times > 5
     made = {"camera_serial": "1", "session_ids": ("a",), "target_name": "drawn", "software_version": "0"}
     file, kept = build_camera_file(found, **made), build_camera_file(found, **made, keep_rays=True)
-    assert (file.rays, kept.rays is None, file.rays_doubt) == (None, False, kept.rays_doubt)
-    assert file.rays_doubt in format_summary(file, target_of(laboratory))
-    assert file.rays_doubt in format_summary(kept, target_of(laboratory))
+    assert (file.rays, kept.rays is None, file.rays_warning) == (None, False, kept.rays_warning)
+    assert file.rays_warning in format_summary(file, target_of(laboratory))
+    assert file.rays_warning in format_summary(kept, target_of(laboratory))
     with pytest.raises(CalibrationError, match="no ray model"):
         select_lens_model(file, LensModel.RAYS)
     sigma_px = np.array(file.uncertainty.sigma_px, np.float64)
@@ -142,7 +142,7 @@ def test_of_a_wide_lens_what_nobody_saw_and_rays_that_do_not_describe_it_are_not
     assert file.uncertainty.not_seen == NOT_SEEN
     assert NOT_SEEN in format_summary(file, target_of(laboratory))
     page = render_calibration_page(file, found)
-    assert file.rays_doubt in page
+    assert file.rays_warning in page
     assert "not seen here" in page
 
 
@@ -265,13 +265,13 @@ def test_models_are_chosen_by_positions_they_were_not_fitted_to(laboratories: li
     assert found.score(BROWN).positions == 34
     assert select_model(found.scores) == BROWN
     assert found.rays_times == pytest.approx(1.0, abs=0.1)
-    assert found.rays_doubt == ""
+    assert found.rays_warning == ""
 
 
 def test_the_uncertainty_of_the_projection_covers_the_truth(laboratories: list[Laboratory]):
-    """Calibrations of one camera and board on several nights differ by what each says it may be off."""
-    nights = [laboratories[0], *(draw(Truth(seed=seed, board_seed=0)) for seed in (11, 12))]
-    adjustments = [adjust(positions(night), board(night), TABLE) for night in nights]
+    """Calibrations of one camera and board on several sessions differ by what each says it may be off."""
+    drawn = [laboratories[0], *(draw(Truth(seed=seed, board_seed=0)) for seed in (11, 12))]
+    adjustments = [adjust(positions(each), board(each), TABLE) for each in drawn]
     first = adjustments[0]
     found = compute_projection_uncertainty(first, 826.0)
     assert found.sigma_px.shape == found.pixels.shape[:2]

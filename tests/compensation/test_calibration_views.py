@@ -94,22 +94,22 @@ def test_the_uncertainty_is_stated_in_words_larger_at_the_corners_and_for_fewer_
     assert np.all(
         compute_projection_sigma_um(few, pixels, 826.0) > 1.2 * compute_projection_sigma_um(many, pixels, 826.0)
     )
-    told = compute_point_uncertainty(many, 826.0)
-    assert told.middle_um == pytest.approx(2 * compute_projection_sigma_um(many, pixels, 826.0)[0])
-    assert told.worst_seen_um >= max(um for um in told.corners_um if um is not None)
-    seen_all = replace(told, corners_um=(1.0,) * 4, not_seen="")
+    stated = compute_point_uncertainty(many, 826.0)
+    assert stated.middle_um == pytest.approx(2 * compute_projection_sigma_um(many, pixels, 826.0)[0])
+    assert stated.worst_seen_um >= max(um for um in stated.corners_um if um is not None)
+    seen_all = replace(stated, corners_um=(1.0,) * 4, not_seen="")
     assert ("at its worst corner" in seen_all.text, NOT_SEEN in seen_all.text) == (True, False)
 
 
-def test_of_corners_that_nobody_saw_nothing_is_said():
+def test_of_corners_that_were_not_seen_nothing_is_reported():
     """A wide lens and a target in its middle: the corners are beyond all markers."""
     views, given = wide_angle_views()
     found = calibrate_views(views, given)
-    told = compute_point_uncertainty(found, 400.0)
-    assert told.corners_um == (None,) * 4
-    assert told.middle_um is not None
-    assert told.middle_um < told.worst_seen_um < 100 * told.middle_um
-    assert NOT_SEEN in told.text
+    stated = compute_point_uncertainty(found, 400.0)
+    assert stated.corners_um == (None,) * 4
+    assert stated.middle_um is not None
+    assert stated.middle_um < stated.worst_seen_um < 100 * stated.middle_um
+    assert NOT_SEEN in stated.text
 
 
 def test_an_outlier_is_left_out():

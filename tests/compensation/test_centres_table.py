@@ -1,4 +1,4 @@
-"""A drift model from a CSV table of centres and temperatures, and what is said of tables that are none."""
+"""A drift model from a CSV table of centres and temperatures, and what is reported of tables that are none."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HEAD = "frame,marker,x_px,y_px,camera_degC"
 
 
 def written(path: Path, *, air: bool) -> Path:
-    """A drawn night as a table."""
+    """A drawn session as a table."""
     seen = record_session(draw_camera(1), make_full_session()).observed
     names = [*HEAD.split(","), "chamber_degC", "role", "time_ns", *(["air_degC"] if air else [])]
     with path.open("w", newline="") as file:

@@ -119,7 +119,7 @@ def test_the_degree_can_be_given(recorded: Recorded, tmp_path: Path):
     model = load_model(tmp_path / "model.json")
     assert isinstance(model, PaperModel)
     assert model.degree == 3
-    assert json.loads((tmp_path / "model.json").read_text())["session_ids"] == ["night"]
+    assert json.loads((tmp_path / "model.json").read_text())["session_ids"] == ["cycle"]
 
 
 @pytest.mark.parametrize("degree", ["0", "6", "-1"])
@@ -133,10 +133,10 @@ def test_a_degree_that_does_not_exist_is_refused_before_the_long_work(recorded: 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["fit", "night", "-o", "model.json", "--degree", "two"], "'--degree'"),
-        (["fit", "night"], "'--out'"),
+        (["fit", "cycle", "-o", "model.json", "--degree", "two"], "'--degree'"),
+        (["fit", "cycle"], "'--out'"),
         (["fit", "-o", "model.json"], "SESSION..."),
-        (["report", "night", "--modle", "m.json"], "--modle"),
+        (["report", "cycle", "--modle", "m.json"], "--modle"),
         (["fits"], "'fits'"),
         (["--loud"], "--loud"),
     ],

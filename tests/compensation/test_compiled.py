@@ -65,7 +65,7 @@ def test_nothing_is_compiled_once_that_was_done_ahead():
 
 
 @pytest.mark.nightly
-def test_what_is_compiled_is_said_once_per_machine_and_no_part_of_the_time_left(tmp_path: Path):
+def test_what_is_compiled_is_reported_once_per_machine_and_no_part_of_the_time_left(tmp_path: Path):
     picture, target = tmp_path / "picture.png", tmp_path / "target.yaml"
     picture.write_bytes(encode_png(photo(0)))
     target.write_text(TARGET_YAML)
@@ -80,11 +80,11 @@ def test_what_is_compiled_is_said_once_per_machine_and_no_part_of_the_time_left(
         "-o",
         tmp_path / "out.csv",
     ]
-    said = [
+    messages = [
         subprocess.run(
             command, env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True, check=True
         ).stderr
         for _ in range(2)
     ]
-    assert ["compiled" in each for each in said] == [True, False]
-    assert all("left" not in each for each in said)  # one picture takes less than the 3 s from which on it is shown
+    assert ["compiled" in each for each in messages] == [True, False]
+    assert all("left" not in each for each in messages)  # one picture takes less than the 3 s from which on it is shown

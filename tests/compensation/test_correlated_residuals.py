@@ -101,20 +101,20 @@ def test_grained_ground_is_fitted_in_a_narrow_band_where_that_is_better_and_fram
     assert after.excess_px2.tolist() == found[0].excess_px2.tolist()
 
 
-def test_a_picture_that_noise_does_not_describe_is_doubtful_and_one_with_noise_alone_is_not():
+def test_a_picture_that_noise_does_not_describe_is_suspect_and_one_with_noise_alone_is_not():
     _, _, grained = errors_px(photograph_grained_paper)
     _, _, noisy = errors_px(photograph_with_noise)
-    assert all(one.is_doubtful for one in grained)
-    assert not any(one.is_doubtful for one in noisy)
-    assert detect(photograph_grained_paper(SCENE, clean(), 9), PAPER, grained[0]).is_doubtful
+    assert all(one.is_suspect for one in grained)
+    assert not any(one.is_suspect for one in noisy)
+    assert detect(photograph_grained_paper(SCENE, clean(), 9), PAPER, grained[0]).is_suspect
 
 
 def test_all_markers_decide_where_a_sample_of_them_is_conspicuous_by_chance():
     """Frames of noise alone whose 27 sampled markers have 1.3 times their variances; JPEG of quality 90 has as much."""
     for seed in (22, 36):
-        assert not detect(photograph_with_noise(SCENE, clean(), seed), PAPER).is_doubtful
+        assert not detect(photograph_with_noise(SCENE, clean(), seed), PAPER).is_suspect
     _, _, compressed = errors_px(make_jpeg_picture(90))
-    assert all(one.is_doubtful for one in compressed)
+    assert all(one.is_suspect for one in compressed)
 
 
 def growth(scatter: Float, clean_markers: NDArray[np.bool_]) -> Float:

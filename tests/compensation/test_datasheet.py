@@ -48,7 +48,7 @@ COEFFICIENTS = ("shift_I_per_K", "shift_J_per_K", "scale_per_K", "turn_per_K")
 
 
 @cache
-def recorded_night(camera_seed: int, effects: tuple[str, ...], seed: int) -> Observations:
+def make_session(camera_seed: int, effects: tuple[str, ...], seed: int) -> Observations:
     """The same for all tests, who read it only."""
     return record_session(draw_camera(camera_seed, *effects), make_full_session(), seed).observed
 
@@ -60,7 +60,7 @@ def sheet_of(observed: Observations, details: MeasurementDetails | None = None) 
 
 @pytest.fixture(scope="module")
 def sheet() -> Datasheet:
-    observed = recorded_night(2003, ("sag",), 1)
+    observed = make_session(2003, ("sag",), 1)
     return compute_datasheet(observed, fit(observed))
 
 
@@ -78,7 +78,7 @@ def at_rest_per_K(camera: Camera) -> Float:
 def test_the_coefficients_of_drawn_cameras_hold_the_truth_within_their_expanded_uncertainty():
     inside, small = [], []
     for seed in range(5):
-        known = sheet_of(recorded_night(2001 + seed, (), seed)).by_key
+        known = sheet_of(make_session(2001 + seed, (), seed)).by_key
         for key, truth in zip(COEFFICIENTS, at_rest_per_K(draw_camera(2001 + seed)), strict=True):
             inside.append(abs(known[key].value - truth) <= known[key].expanded)
         small.append(known["scale_per_K"].expanded / abs(known["scale_per_K"].value))
@@ -87,13 +87,13 @@ def test_the_coefficients_of_drawn_cameras_hold_the_truth_within_their_expanded_
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_two_nights_of_a_camera_agree(sheet: Datasheet):
-    observed = recorded_night(2003, ("sag",), 2)
+def test_two_sessions_of_a_camera_agree(sheet: Datasheet):
+    observed = make_session(2003, ("sag",), 2)
     other = compute_datasheet(observed, fit(observed)).by_key
     for one in sheet.quantities:
         assert abs(one.value - other[one.key].value) <= math.hypot(one.expanded, other[one.key].expanded), one.key
     assert "not measured" not in render_datasheet_page(sheet)
-    worse = sheet_of(recorded_night(2003, ("sag",), 1)).by_key
+    worse = sheet_of(make_session(2003, ("sag",), 1)).by_key
     assert math.isnan(worse["left_thermal_I"].value)
 
 
@@ -122,22 +122,22 @@ def test_a_budget_adds_up_and_its_expanded_uncertainty_is_twice_the_root(sheet: 
 
 
 def test_the_air_s_uncertainty_counts_in_what_depends_on_it():
-    observed = recorded_night(2003, ("sag",), 1)
+    observed = make_session(2003, ("sag",), 1)
     known, worse = (sheet_of(observed, MeasurementDetails(u_air_K=u_K)).by_key for u_K in (0.1, 0.5))
     for key in (*COEFFICIENTS, "self_heating_K"):
         assert worse[key].u > known[key].u
     assert worse["hysteresis_I"].u == known["hysteresis_I"].u
 
 
-def test_several_nights_are_pooled_and_their_difference_is_a_contribution():
+def test_several_sessions_are_pooled_and_their_difference_is_a_contribution():
     lines = Contribution("noise", "A", 0.3, "px", ""), Contribution("air", "B", 0.1, "K", "", 2.0)
     one = MeasuredQuantity("k", "g", "n", "px", "m").found(1.0, *lines)
     both = pool_sessions([one, replace(one, value=1.2)])
     assert both.value == pytest.approx(1.1)
-    a, b, nights = both.contributions
+    a, b, repeated = both.contributions
     assert a.amount == pytest.approx(0.3 / math.sqrt(2))
     assert b.amount == pytest.approx(0.2)
-    assert (nights.source, nights.amount) == (BETWEEN_SESSIONS, pytest.approx(0.1))
+    assert (repeated.source, repeated.amount) == (BETWEEN_SESSIONS, pytest.approx(0.1))
     assert pool_sessions([replace(one, value=math.nan), one]) == one
 
 
@@ -169,14 +169,14 @@ def test_of_two_sessions_each_counts_and_their_difference_is_stated():
     )
     both = after(one, other)
     sheet = compute_datasheet(both, fit_paper(both))
-    assert len(sheet.nights) == 2
-    for pooled_one, first, second in zip(sheet.quantities, *sheet.nights, strict=False):
+    assert len(sheet.by_session) == 2
+    for pooled_one, first, second in zip(sheet.quantities, *sheet.by_session, strict=False):
         assert pooled_one.value == pytest.approx((first.value + second.value) / 2)
         assert BETWEEN_SESSIONS in {line.source for line in pooled_one.contributions}
     page = render_datasheet_page(sheet)
     assert "From 2 sessions" in page
     assert "One session was recorded" not in page
-    assert len(json.loads(serialise_datasheet(sheet))["nights"]) == 2
+    assert len(json.loads(serialise_datasheet(sheet))["quantities_by_session"]) == 2
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -260,7 +260,7 @@ def test_the_command_writes_what_the_name_says(recorded: Recorded, tmp_path: Pat
     assert (refused.exit_code, "ends in .html, .pdf, .json" in refused.output) == (2, True)
 
 
-def test_the_noise_of_the_markers_is_small_beside_the_rest(sheet: Datasheet):
+def test_the_noise_of_the_markers_is_small_against_the_rest(sheet: Datasheet):
     assert NOISE_PX / math.sqrt(54) < sheet.by_key["warm_up_shift_J"].u
 
 

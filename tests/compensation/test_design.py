@@ -1,4 +1,4 @@
-"""A night that decides: what is foreseen of a camera, what is chosen to be visited, and when enough is known."""
+"""A session that decides: what is foreseen of a camera, what is chosen to be visited, and when enough is known."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def observed() -> Observations:
 
 
 def up_to(observed: Observations, frames: int) -> Observations:
-    """As if the night had only so many frames so far."""
+    """As if the session had only so many frames so far."""
     columns = {
         name: getattr(observed, name)[:frames]
         for name in ("session", "frame", "time_ns", "role", "step_id", "chamber_degC", "camera_degC", "air_degC")
@@ -127,15 +127,15 @@ def test_decisions_are_the_same_for_the_same_frames_and_stay_within_what_is_want
     assert decided.soak_s in WANTED.soaks_s
 
 
-def test_before_there_is_a_model_what_is_furthest_is_visited(observed: Observations):
+def test_without_a_model_what_is_furthest_is_visited(observed: Observations):
     first = decide(up_to(observed, 80), WANTED)
     assert (first.kind, first.chamber_degC) == ("visit", 52.0)
     assert np.isnan(first.predicted_px)
 
 
-def test_what_is_left_between_set_points_is_looked_at_before_the_night_goes_on(observed: Observations):
-    """After 52 and 10 degC only the reference lies between others: what a form leaves there cannot be told from how it
-    extrapolates, and more at the ends would not change that."""
+def test_what_is_left_between_set_points_is_looked_at_before_the_session_goes_on(observed: Observations):
+    """After 52 and 10 degC only the reference lies between others: what a form leaves there cannot be reported from how
+    it extrapolates, and more at the ends would not change that."""
     begun = up_to(observed, 90)
     predicted_px = decide(begun, WANTED).predicted_px
     decision = decide(begun, replace(WANTED, residual_px=0.95 * predicted_px))

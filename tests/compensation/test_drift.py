@@ -263,16 +263,16 @@ def test_too_few_temperatures_are_refused_with_a_sentence(
         fit_paper(observations(quadratic, fit_degC=fit_degC), degree)
 
 
-def test_a_warm_up_session_beside_it_changes_nothing(noisy: Observations, model: PaperModel):
+def test_a_warm_up_session_given_as_well_changes_nothing(noisy: Observations, model: PaperModel):
     warm_up = observations(quadratic, session=facts("warm-up"))
     warm_up = replace(warm_up, role=np.array(["warm_up"] * len(warm_up.frame)))
     both = fit_paper(concatenate([warm_up, noisy]))
     np.testing.assert_array_equal(both.coefficients, model.coefficients)
     np.testing.assert_array_equal(both.facts.reference_centres_px, model.facts.reference_centres_px)
-    assert both.facts.session_ids == ("warm-up", "night-1")
+    assert both.facts.session_ids == ("warm-up", "cycle-1")
 
 
-def test_two_nights_with_the_target_moved_between_them_are_one_fit(noisy: Observations):
+def test_two_sessions_with_the_target_moved_between_them_are_one_fit(noisy: Observations):
     other = observations(quadratic, NOISE_PX, seed=9, session=facts("night-2"))
     other = replace(other, centres_px=other.centres_px + 3.0)
     fitted = fit_paper(concatenate([noisy, other]))
@@ -280,8 +280,8 @@ def test_two_nights_with_the_target_moved_between_them_are_one_fit(noisy: Observ
     np.testing.assert_allclose(fitted.shift(points, 60.0), points - quadratic(points, 21.0), rtol=0, atol=NOISE_PX)
 
 
-def test_nights_with_different_reference_temperatures_are_refused(noisy: Observations):
-    other = observations(quadratic, NOISE_PX, session=facts("night-2"))
+def test_sessions_with_different_reference_temperatures_are_refused(noisy: Observations):
+    other = observations(quadratic, NOISE_PX, session=facts("cycle-2"))
     chamber = np.where(other.role == "reference", 20.0, other.chamber_degC)
     with pytest.raises(SessionError, match="different reference temperatures: 20, 24 degC"):
         fit_paper(concatenate([noisy, replace(other, chamber_degC=chamber)]))
@@ -299,10 +299,10 @@ def test_markers_in_one_line_are_refused(noisy: Observations):
 @pytest.mark.parametrize("noise_px", [0.0, 0.05])
 def test_markers_in_one_line_with_their_noise_are_refused(noise_px: float):
     """With noise across the line the polynomial is determined, but by nothing."""
-    night = observations(quadratic, noise_px, seed=3)
-    row = np.where(np.arange(54)[:, None] < 9, night.centres_px, np.nan)
+    seen = observations(quadratic, noise_px, seed=3)
+    row = np.where(np.arange(54)[:, None] < 9, seen.centres_px, np.nan)
     with pytest.raises(SessionError, match="in one line"):
-        fit_paper(replace(night, centres_px=row))
+        fit_paper(replace(seen, centres_px=row))
 
 
 def test_two_rows_of_markers_do_not_determine_degree_4(noisy: Observations):

@@ -18,21 +18,21 @@ NOISE_PX = 0.005
 
 
 @pytest.fixture(scope="module")
-def night() -> Observations:
+def seen() -> Observations:
     return observations(quadratic, NOISE_PX, seed=4)
 
 
 @pytest.fixture(scope="module")
-def model(night: Observations) -> PaperModel:
-    return fit_paper(night)
+def model(seen: Observations) -> PaperModel:
+    return fit_paper(seen)
 
 
 def true_rms(above_K: float) -> np.ndarray:
     return np.sqrt(((quadratic(places_px(), above_K) - places_px()) ** 2).mean(axis=0))
 
 
-def test_before_is_the_drift_and_after_is_the_noise(night: Observations, model: PaperModel):
-    got = evaluate(model, night)
+def test_before_is_the_drift_and_after_is_the_noise(seen: Observations, model: PaperModel):
+    got = evaluate(model, seen)
     truth = np.sqrt(np.mean([true_rms(degC - 24) ** 2 for degC in HELD_OUT_DEGC], axis=0))
     np.testing.assert_allclose(got.rms_before_px, truth, rtol=0.01)
     np.testing.assert_allclose(got.rms_after_px, NOISE_PX * np.sqrt(1 + 1 / 8), rtol=0.06)
@@ -40,13 +40,13 @@ def test_before_is_the_drift_and_after_is_the_noise(night: Observations, model: 
     assert not got.outside.any()
 
 
-def test_the_95_percent_interval_holds_95_percent(night: Observations, model: PaperModel):
-    for part in evaluate(model, night).coverage_95:
+def test_the_95_percent_interval_holds_95_percent(seen: Observations, model: PaperModel):
+    for part in evaluate(model, seen).coverage_95:
         assert 0.92 <= part <= 0.98
 
 
-def test_each_temperature_has_its_own_rms(night: Observations, model: PaperModel):
-    got = evaluate(model, night).temperatures
+def test_each_temperature_has_its_own_rms(seen: Observations, model: PaperModel):
+    got = evaluate(model, seen).temperatures
     assert [row.chamber_degC for row in got] == list(HELD_OUT_DEGC)
     assert [row.camera_degC for row in got] == [degC + 15 for degC in HELD_OUT_DEGC]
     for row in got:
@@ -76,11 +76,11 @@ def test_temperatures_beyond_the_fit_are_reported(model: PaperModel):
     np.testing.assert_array_equal(evaluate(model, hotter).outside, np.repeat([False, True], 2 * 54))
 
 
-def test_the_score_of_another_camera_is_refused(night: Observations, model: PaperModel):
+def test_the_score_of_another_camera_is_refused(seen: Observations, model: PaperModel):
     with pytest.raises(SessionError, match=r"TS-0001, .* of camera other"):
-        evaluate(model, replace(night, sessions=(facts(camera="other"),)))
+        evaluate(model, replace(seen, sessions=(facts(camera="other"),)))
     with pytest.raises(SessionError, match="images of"):
-        evaluate(model, replace(night, image_size=(640, 480)))
+        evaluate(model, replace(seen, image_size=(640, 480)))
 
 
 def test_too_few_temperatures_to_leave_one_out_are_refused(model: PaperModel):
@@ -89,9 +89,9 @@ def test_too_few_temperatures_to_leave_one_out_are_refused(model: PaperModel):
         evaluate(model, few)
 
 
-def test_the_table_stands_beside_the_papers(night: Observations, model: PaperModel):
+def test_the_table_is_shown_with_the_papers(seen: Observations, model: PaperModel):
     exact = replace(
-        evaluate(model, night), before_px=np.array([[0.2, -0.5]]), after_px=np.array([[-0.01, 0.05]]), frames=12
+        evaluate(model, seen), before_px=np.array([[0.2, -0.5]]), after_px=np.array([[-0.01, 0.05]]), frames=12
     )
     assert format_table(exact).splitlines()[1:] == [
         "                                 along I                       along J",

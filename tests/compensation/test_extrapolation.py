@@ -1,4 +1,4 @@
-"""A model asked for temperatures it was not fitted to, or about another night: it says so, or its interval grows."""
+"""A model asked for temperatures it was not fitted to, or about another session: it says so, or its interval grows."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def seed(request: pytest.FixtureRequest) -> int:
 
 @cache
 def narrow(seed: int) -> tuple[ThermalModel, DrawnSession]:
-    """A model and the night it was fitted to; the same for all tests, who read them only."""
+    """A model and the session it was fitted to; the same for all tests, who read them only."""
     made = record_session(draw_camera(seed), [*warm_up(), *reference(), *cycle(NARROW_DEGC, (20, 34, 41))], seed)
     model = fit(made.observed, form="thermal")
     assert isinstance(model, ThermalModel)
@@ -75,7 +75,7 @@ def test_a_form_without_lags_knows_the_range_of_the_air() -> None:
     assert model.valid.ambient_degC[1] < 46
 
 
-def test_the_interval_of_another_night_knows_of_a_dead_zone_that_no_sensor_sees() -> None:
+def test_the_interval_of_another_session_knows_of_a_dead_zone_that_no_sensor_sees() -> None:
     """The camera's mount has two, of its own temperature. Without the jackknife over set-points 77 % hold."""
     camera = draw_camera(2603, "dead_zone")
     followed: list[Stretch] = []

@@ -53,8 +53,8 @@ def serial(pieces: list[Piece]) -> list[FoundMarkers]:
 
 def assert_same(one: FoundMarkers, other: FoundMarkers) -> None:
     for field in fields(FoundMarkers):
-        here, there = getattr(one, field.name), getattr(other, field.name)
-        assert (here.dtype, here.shape, here.tobytes()) == (there.dtype, there.shape, there.tobytes()), field.name
+        here, second = getattr(one, field.name), getattr(other, field.name)
+        assert (here.dtype, here.shape, here.tobytes()) == (second.dtype, second.shape, second.tobytes()), field.name
 
 
 def assert_all_same(found: dict[int, FoundMarkers], serial: list[FoundMarkers]) -> None:

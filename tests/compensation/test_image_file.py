@@ -96,8 +96,8 @@ def detect(*arguments: object) -> str:
 def test_what_is_read_may_be_chosen(tmp_path: Path):
     path, out = tmp_path / "photo.png", tmp_path / "markers.csv"
     path.write_bytes(png(1000, 1000))
-    said = detect(path, "-o", out, "--max-megapixels", "0.9")
-    assert said.startswith(f"error: {path}: claims 1000 x 1000 px; up to 0.9 megapixels are read")
+    answer = detect(path, "-o", out, "--max-megapixels", "0.9")
+    assert answer.startswith(f"error: {path}: claims 1000 x 1000 px; up to 0.9 megapixels are read")
     assert "found 0 of 54 markers" in detect(path, "-o", out, "--max-megapixels", "1")
     with allow_images_up_to(100):
         path.write_bytes(png(9_000, 9_000))

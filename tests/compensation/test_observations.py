@@ -53,7 +53,7 @@ def observed(recorded: Recorded) -> Observations:
 @pytest.fixture(scope="module")
 def recorded_frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of one frame."""
-    path = tmp_path_factory.mktemp("frame") / "night"
+    path = tmp_path_factory.mktemp("frame") / "cycle"
     asyncio.run(record(path, {"target.yaml": TARGET_YAML}, frames=1))
     return path
 
@@ -64,7 +64,7 @@ def test_every_frame_has_its_role_and_temperatures(observed: Observations):
     assert observed.step_id[4] == "step-4"
     assert observed.frame.tolist() == list(range(len(SEQUENCE)))
     assert observed.image_size == (640, 480)
-    assert observed.sessions[0].session_id == "night"
+    assert observed.sessions[0].session_id == "cycle"
     assert observed.sessions[0].camera_serial == "TS-0001"
 
 
@@ -131,8 +131,8 @@ def test_a_damaged_frame_is_named(recorded: Recorded, tmp_path: Path):
 def test_frames_of_a_capture_that_was_restarted_do_not_count(tmp_path: Path):
     after_ns = START_NS + 2 * 60 * NS_PER_S + 1
     again = make_restart_event(after_ns, "step-1", 1, "after a long interruption")
-    asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
-    session = Session.open(tmp_path / "night")
+    asyncio.run(record(tmp_path / "cycle", {"target.yaml": TARGET_YAML}, frames=4, events={2: again}))
+    session = Session.open(tmp_path / "cycle")
     seen = observe_session(session, read_session_target(session))
     assert seen.reasons == ("", "its capture was restarted", "", "")
     assert np.isnan(seen.centres_px[1]).all()
@@ -148,14 +148,14 @@ def test_a_session_without_or_with_a_wrong_target_is_refused(tmp_path: Path):
 
 
 def test_a_session_that_never_shows_the_target_is_refused(tmp_path: Path):
-    asyncio.run(record(tmp_path / "night", {"target.yaml": TARGET_YAML}, frames=3))
-    session = Session.open(tmp_path / "night")
+    asyncio.run(record(tmp_path / "cycle", {"target.yaml": TARGET_YAML}, frames=3))
+    session = Session.open(tmp_path / "cycle")
     with pytest.raises(SessionError, match="no frame can"):
         observe_session(session, read_session_target(session).model_copy(update={"columns": 12, "minimum_markers": 72}))
 
 
 def test_sessions_are_put_end_to_end_with_references_of_their_own():
-    first, moved = observations(quadratic), observations(quadratic, session=facts("night-2"))
+    first, moved = observations(quadratic), observations(quadratic, session=facts("cycle-2"))
     both = concatenate([first, replace(moved, centres_px=moved.centres_px + 5.0)])
     assert both.session.tolist() == [0] * 34 + [1] * 34
     centres, variance = average_reference_centres(both)
@@ -170,9 +170,9 @@ def test_sessions_are_put_end_to_end_with_references_of_their_own():
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"sessions": (facts("night-2", camera="other"),)}, "camera TS-0001 and other"),
-        ({"image_size": (640, 480), "sessions": (facts("night-2"),)}, "image size"),
-        ({}, "night-1 is given twice"),
+        ({"sessions": (facts("cycle-2", camera="other"),)}, "camera TS-0001 and other"),
+        ({"image_size": (640, 480), "sessions": (facts("cycle-2"),)}, "image size"),
+        ({}, "cycle-1 is given twice"),
     ],
 )
 def test_sessions_that_do_not_belong_together_are_refused(change: dict[str, object], sentence: str):
@@ -184,7 +184,7 @@ def test_sessions_that_do_not_belong_together_are_refused(change: dict[str, obje
 def test_a_session_without_reference_frames_has_no_displacements():
     lonely = observations(quadratic)
     lonely = replace(lonely, role=np.where(lonely.role == "reference", "other", lonely.role))
-    with pytest.raises(SessionError, match=r"night-1 .* reference frames"):
+    with pytest.raises(SessionError, match=r"cycle-1 .* reference frames"):
         compute_displacements(lonely, lonely.of(Role.FIT))
 
 
@@ -206,8 +206,8 @@ runner = CliRunner()
 
 @pytest.fixture
 def holed(recorded: Recorded, tmp_path: Path) -> Path:
-    """The second segment of the frames, ten minutes of the night, is missing."""
-    path = Path(shutil.copytree(recorded.path, tmp_path / "night"))
+    """The second segment of the frames, ten minutes of the session, is missing."""
+    path = Path(shutil.copytree(recorded.path, tmp_path / "cycle"))
     assert len(list((path / "frames").glob("*.mcap"))) == 2
     (path / "frames" / "0000.mcap").unlink()
     return path
@@ -218,16 +218,16 @@ def ask(*arguments: object) -> tuple[int, str]:
     return result.exit_code, " ".join(result.stderr.split())
 
 
-def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path, tmp_path: Path):
+def test_the_markers_of_incomplete_sessions_are_found_when_it_is_asked_for(holed: Path, tmp_path: Path):
     out = tmp_path / "markers.csv"
-    status, said = ask("detect", holed, "-o", out)
+    status, answer = ask("detect", holed, "-o", out)
     assert status == 1
-    assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in said
-    assert said.endswith("to read the rest")
+    assert "is incomplete; missing: frames/0000.mcap (to 2026-01-01 18:1" in answer
+    assert answer.endswith("to read the rest")
     assert not out.exists()
-    status, said = ask("detect", holed, "-o", out, "--incomplete")
+    status, answer = ask("detect", holed, "-o", out, "--incomplete")
     assert status == 0
-    assert f"warning: {holed}: is incomplete; missing: frames/0000.mcap" in said
+    assert f"warning: {holed}: is incomplete; missing: frames/0000.mcap" in answer
     assert 0 < len({line.split(",")[0] for line in out.read_text().splitlines()[1:]}) < len(SEQUENCE)
 
 
@@ -242,13 +242,13 @@ def test_the_markers_of_what_is_there_are_found_when_it_is_asked_for(holed: Path
 )
 def test_each_command_refuses_it_with_the_same_sentence(holed: Path, tmp_path: Path, command: tuple[str, ...]):
     out = tmp_path / "out.html"
-    status, said = ask(*(text.format(session=holed, out=out) for text in command))
+    status, answer = ask(*(text.format(session=holed, out=out) for text in command))
     assert status == 1
-    assert said.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
-    assert said.endswith("to read the rest")
+    assert answer.startswith(f"error: {holed}: is incomplete; missing: frames/0000.mcap (to ")
+    assert answer.endswith("to read the rest")
     assert not out.exists()
-    _, said = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
-    assert said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")
+    _, answer = ask(*(text.format(session=holed, out=out) for text in command), "--incomplete")
+    assert answer.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap (to ")
 
 
 def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded, tmp_path: Path):
@@ -258,18 +258,18 @@ def test_corrections_want_the_whole_session_too(holed: Path, recorded: Recorded,
     points.write_text(f"x_px,y_px,time_ns\n320,240,{time_ns}\n")
     for source in ((holed,), (points, "--session", holed)):
         out = tmp_path / "out"
-        status, said = ask("apply", model, *source, "-o", out)
+        status, answer = ask("apply", model, *source, "-o", out)
         assert status == 1
-        assert said.endswith("to read the rest")
+        assert answer.endswith("to read the rest")
         assert not out.exists()
-    status, said = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
-    assert (status, said.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)
+    status, answer = ask("apply", model, points, "--session", holed, "-o", tmp_path / "out.csv", "--incomplete")
+    assert (status, answer.startswith(f"warning: {holed}: is incomplete; missing: frames/0000.mcap")) == (0, True)
 
 
 @pytest.fixture
 def unfinished(recorded: Recorded, tmp_path: Path) -> Path:
     """A killed recorder has left the second segment of the frames."""
-    path = Path(shutil.copytree(recorded.path, tmp_path / "night"))
+    path = Path(shutil.copytree(recorded.path, tmp_path / "cycle"))
     last = path / "frames" / "0001.mcap"
     last.rename(last.with_name("0001.mcap.part"))
     return path
@@ -277,17 +277,17 @@ def unfinished(recorded: Recorded, tmp_path: Path) -> Path:
 
 def test_what_a_killed_recorder_left_is_not_left_out_in_silence(unfinished: Path, tmp_path: Path):
     out = tmp_path / "markers.csv"
-    status, said = ask("detect", unfinished, "-o", out)
+    status, answer = ask("detect", unfinished, "-o", out)
     assert status == 1
-    assert said.startswith(f"error: {unfinished}: frames/0001.mcap.part is not finished")
-    assert f"`stand session repair {unfinished}`" in said
+    assert answer.startswith(f"error: {unfinished}: frames/0001.mcap.part is not finished")
+    assert f"`stand session repair {unfinished}`" in answer
     assert not out.exists()
-    status, said = ask("detect", unfinished, "-o", out, "--incomplete")
+    status, answer = ask("detect", unfinished, "-o", out, "--incomplete")
     assert status == 0
-    assert f"warning: {unfinished}: frames/0001.mcap.part is not finished" in said
+    assert f"warning: {unfinished}: frames/0001.mcap.part is not finished" in answer
     salvage_session(unfinished)
-    status, said = ask("detect", unfinished, "-o", out)
-    assert (status, "warning" in said) == (0, False)
+    status, answer = ask("detect", unfinished, "-o", out)
+    assert (status, "warning" in answer) == (0, False)
 
 
 # Of a session of several cameras each has observations, temperatures and a serial number of its own.
@@ -309,7 +309,7 @@ def of_both(index: int, time_ns: int) -> Iterator[Item]:
 
 @pytest.fixture(scope="module")
 def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("several") / "night"
+    path = tmp_path_factory.mktemp("several") / "cycle"
     devices = {**STAND, "side": "camera"}
     asyncio.run(record_items(path, of_both, FRAMES, 60, devices=devices, serials="TS-0001, TS-0002"))
     return path
@@ -344,7 +344,7 @@ def model_of(folder: Path, serial: str) -> Path:
         reference_centres_px=np.array([[10.0, 9.0]]),
         target_name="small",
         camera_serial=serial,
-        session_ids=("night",),
+        session_ids=("cycle",),
         software_version="0",
         camera_range_degC=(0.0, 90.0),
     )

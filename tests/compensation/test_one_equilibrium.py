@@ -35,12 +35,12 @@ def items(gap_index: int, *, superseded: bool = False, role: str = "fit"):
 
 
 async def test_frames_of_both_sides_are_refused_unless_somebody_wants_them(tmp_path: Path):
-    await record(tmp_path / "night", items=items(6))
+    await record(tmp_path / "cycle", items=items(6))
     with pytest.raises(SessionError, match=r"15\.20 K before .* 13\.10 K after"):
-        check_one_equilibrium(Session.open(tmp_path / "night"))
+        check_one_equilibrium(Session.open(tmp_path / "cycle"))
     for command in (
-        ["fit", str(tmp_path / "night"), "-o", str(tmp_path / "model.json")],
-        ["report", str(tmp_path / "night"), "-o", str(tmp_path / "report.html")],
+        ["fit", str(tmp_path / "cycle"), "-o", str(tmp_path / "model.json")],
+        ["report", str(tmp_path / "cycle"), "-o", str(tmp_path / "report.html")],
     ):
         refused = CliRunner().invoke(app, command)
         assert refused.exit_code != 0
@@ -51,5 +51,5 @@ async def test_frames_of_both_sides_are_refused_unless_somebody_wants_them(tmp_p
 
 @pytest.mark.parametrize(("gap_index", "options"), [(0, {}), (6, {"superseded": True}), (6, {"role": "warm_up"})])
 async def test_frames_of_one_side_are_of_one_equilibrium(tmp_path: Path, gap_index: int, options: dict[str, Any]):
-    await record(tmp_path / "night", items=items(gap_index, **options))
-    check_one_equilibrium(Session.open(tmp_path / "night"))
+    await record(tmp_path / "cycle", items=items(gap_index, **options))
+    check_one_equilibrium(Session.open(tmp_path / "cycle"))

@@ -62,10 +62,10 @@ def detected(numbers: tuple[int, ...], out: Path) -> Detected:
 
 
 @pytest.mark.parametrize(("numbers", "doubtless"), [(BY_DAY, 0), mark_nightly(OTHERS, 1)])
-def test_noise_does_not_describe_webcam_pictures_of_a_print_and_that_is_said(
+def test_noise_does_not_describe_webcam_pictures_of_a_print_and_that_is_reported(
     numbers: tuple[int, ...], doubtless: int, detected_of: Callable[[tuple[int, ...]], Detected]
 ):
-    assert [one.is_doubtful for one in detected_of(numbers)[1]].count(False) <= doubtless
+    assert [one.is_suspect for one in detected_of(numbers)[1]].count(False) <= doubtless
 
 
 @pytest.fixture(params=[*BY_DAY, *map(mark_nightly, OTHERS)], ids="{}.png".format)

@@ -48,7 +48,7 @@ def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, m
 
 
 @pytest.mark.parametrize("package", [recording, markers, compensation, thermostand])
-def test_each_public_name_is_there_and_no_other(package: object):
+def test_each_public_name_exists_and_no_other(package: object):
     names = dir(package)
     assert len(names) > 5
     for name in names:
@@ -182,14 +182,14 @@ def test_lists_do_as_arrays_and_points_of_another_shape_are_refused():
         model.correct(np.array([300.0, 200.0]), 50.0)
 
 
-def test_every_name_that_the_notebook_page_uses_is_there():
+def test_every_name_that_the_notebook_page_uses_exists():
     names = set(re.findall(r"thermostand\.([A-Za-z_]+)", NOTEBOOK))
     assert {"states", "rereference", "calibrate_views"} <= names
     assert names <= set(dir(thermostand))
 
 
 def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings():
-    """Frames at the ends of a night; in between the camera was off for two hours, which frames alone do not tell."""
+    """Frames at the ends of a session; in between the camera was off for two hours, which frames alone do not tell."""
     air_ns = np.arange(0, 8 * 3600, 60) * 10**9
     hours = air_ns / 3.6e12
     is_on = ((hours < 3) | (hours >= 5)).astype(float)
@@ -197,21 +197,21 @@ def test_a_camera_that_was_off_in_between_is_known_from_its_supply_and_readings(
     frames = np.isin(air_ns, air_ns[[10, 60, 170, 312]])
     air = (air_ns, np.full(len(air_ns), 24.0))
     known: dict[str, Any] = {"air": air}
-    told: dict[str, Any] = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
+    supplied: dict[str, Any] = known | {"supply": (air_ns, is_on), "camera": (air_ns, own_degC)}
     slow = [lag(POWER, 1620.0)]
     memory = ThermalStateSpec(tuple(slow))
     history = ThermalHistory(*air, air_ns, is_on, air_ns[is_on > 0], own_degC[is_on > 0])
     truth = compute_states_at(history, memory, air_ns[frames], own_degC[frames])
     model: Any = SimpleNamespace(memory=memory)
-    found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **told)
+    found = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **supplied)
     np.testing.assert_allclose(found.of(slow), truth.of(slow))
     blind = thermostand.states(model, time_ns=air_ns[frames], camera_degC=own_degC[frames], **known)
     assert np.abs(blind.of(slow) - truth.of(slow)).max() > 0.1
     centres_px = np.tile([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0], [9.0, 9.0]], (4, 1, 1))
-    seen = thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], **told)
+    seen = thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], **supplied)
     np.testing.assert_allclose(compute_frame_states(seen, memory).of(slow), truth.of(slow))
     with pytest.raises(ValueError, match="only together with air"):
-        thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], supply=told["supply"])
+        thermostand.observations_of(centres_px, own_degC[frames], air_ns[frames], supply=supplied["supply"])
     with pytest.raises(ValueError, match="time_ns go backwards"):
         thermostand.states(model, time_ns=air_ns[::-1], **known)
 

@@ -83,22 +83,22 @@ HEADINGS = (
 
 @pytest.fixture(scope="module")
 def analysed() -> Analysed:
-    night = observations(quadratic, 0.005)
-    role = night.role.astype("U16")
+    recorded = observations(quadratic, 0.005)
+    role = recorded.role.astype("U16")
     role[:4] = "warm_up"
     reasons = ("",) * 33 + ("found 3 of 54 markers <of> paper-9x6",)
-    flags = night.flags.copy()
+    flags = recorded.flags.copy()
     flags[5, 7] = 2
-    step_id = ("warm-up",) * 4 + night.step_id[4:]
-    night = replace(night, role=role, reasons=reasons, flags=flags, step_id=step_id)
-    model = fit_paper(night)
-    return night, model, evaluate(model, night)
+    step_id = ("warm-up",) * 4 + recorded.step_id[4:]
+    recorded = replace(recorded, role=role, reasons=reasons, flags=flags, step_id=step_id)
+    model = fit_paper(recorded)
+    return recorded, model, evaluate(model, recorded)
 
 
 @pytest.fixture(scope="module")
 def written(analysed: Analysed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("written") / "report.html"
-    write_report(path, *analysed, Extras(budgets={"night-1": BUDGET}))
+    write_report(path, *analysed, Extras(budgets={"cycle-1": BUDGET}))
     return path
 
 
@@ -148,7 +148,7 @@ def test_its_figures_are_sound_svg_with_ids_of_their_own(page: str):
 
 
 def test_the_same_data_give_the_same_bytes(analysed: Analysed, written: Path, tmp_path: Path):
-    write_report(tmp_path / "again.html", *analysed, Extras(budgets={"night-1": BUDGET}))
+    write_report(tmp_path / "again.html", *analysed, Extras(budgets={"cycle-1": BUDGET}))
     assert (tmp_path / "again.html").read_bytes() == written.read_bytes()
     assert (tmp_path / "again.json").read_bytes() == written.with_suffix(".json").read_bytes()
 
@@ -159,10 +159,10 @@ def test_it_says_what_was_found_and_what_was_left_out(page: str, analysed: Analy
         "Thermal compensation of camera TS-0001",
         "0.191", "0.576", "0.100", "0.090",
         f"{analysed[2].rms_before_px[1]:.3f}",
-        "night-1", "thermal-cycle",
+        "cycle-1", "thermal-cycle",
         "34 (4 reference, 14 fit, 12 validation, 4 warm-up); 1 of them cannot be used",
         "1 left out (1 saturated)",
-        "<td>found 3 of 54 markers &lt;of&gt; paper-9x6</td><td>night-1</td><td>1</td><td>33</td>",
+        "<td>found 3 of 54 markers &lt;of&gt; paper-9x6</td><td>cycle-1</td><td>1</td><td>33</td>",
         "camera 25.00 to 67.00 °C",
         "<td>granite along the axis</td><td>25.17</td><td>4.05</td><td>-48.61</td><td>7.82</td>",
         "<td>linear table, resolution</td><td>0.31</td><td></td><td>0.47</td><td></td>",
@@ -201,9 +201,9 @@ def test_page_and_file_have_the_numbers_of_the_evaluation(page: str, written: Pa
     assert f"<td>{i:.3f}</td><td>{j:.3f}</td>" in page
     gap = found["hysteresis_before"][0]["largest_px"]
     assert gap == [None, None] or f"{1e3 * gap[1]:z.1f}" in page
-    assert found["budgets"]["night-1"]["contributions"][1]["u_um"] is None
+    assert found["budgets"]["cycle-1"]["contributions"][1]["u_um"] is None
     assert found["unusable"] == [
-        {"session_id": "night-1", "reason": "found 3 of 54 markers <of> paper-9x6", "frames": [33]}
+        {"session_id": "cycle-1", "reason": "found 3 of 54 markers <of> paper-9x6", "frames": [33]}
     ]
 
 
@@ -222,18 +222,18 @@ def test_an_interval_that_claims_too_much_is_reported(numbers: ReportNumbers):
     assert "thermal lag, hysteresis" in render_numbers(too_few)
 
 
-def test_a_model_of_one_night_says_what_one_night_does_not_show(numbers: ReportNumbers):
+def test_a_model_of_one_session_says_what_one_session_does_not_show(numbers: ReportNumbers):
     assert numbers.model is not None
-    one = replace(numbers.model, between_nights_px=(0.004, 0.009))
-    two = replace(one, session_ids=("night-1", "night-2"), nights_compared=2)
-    for model, said, row in (
+    one = replace(numbers.model, between_sessions_px=(0.004, 0.009))
+    two = replace(one, session_ids=("cycle-1", "cycle-2"), sessions_compared=2)
+    for model, message, row in (
         (one, "was assumed, not measured", "fitted, assumed"),
         (two, "", "fitted, of 2 compared"),
         (numbers.model, "is not known", ""),  # of the paper's form
     ):
         page = render_numbers(replace(numbers, model=model))
-        assert (f"How well sessions repeat {said}" in page) == bool(said)
-        assert ("How well sessions repeat" in page) == bool(said)
+        assert (f"How well sessions repeat {message}" in page) == bool(message)
+        assert ("How well sessions repeat" in page) == bool(message)
         assert ("added by a session" in page) == bool(row)
         assert row in page
 
@@ -259,9 +259,9 @@ def test_a_session_with_only_a_warm_up_has_its_drift_alone(tmp_path: Path):
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_session_without_held_out_temperatures_or_warm_up_is_scored_by_leaving_out():
-    night = observations(quadratic, 0.005, held_out_degC=())
-    model = fit_paper(night, 2)
-    text = render_report(night, model, evaluate(model, night))
+    recorded = observations(quadratic, 0.005, held_out_degC=())
+    model = fit_paper(recorded, 2)
+    text = render_report(recorded, model, evaluate(model, recorded))
     assert headings(text) == [
         name for name in HEADINGS if name not in ("Warm-up", "The stand's budget", "Frames left out")
     ]
@@ -320,30 +320,30 @@ def test_its_numbers_do_not_take_the_place_of_another_file(tmp_path: Path):
 
 
 def test_what_the_model_leaves_of_a_warm_up_is_reported(numbers: ReportNumbers, page: str, analysed: Analysed):
-    night, model, _ = analysed
+    recorded, model, _ = analysed
     (warm_up,) = numbers.warm_ups  # four of the frames at the reference: nothing is left but noise
     np.testing.assert_allclose(warm_up.left_px, 0.005 * np.sqrt(1 + 1 / 4), rtol=0.15)
     assert "".join(f"<td>{1e3 * value:.1f}</td>" for value in warm_up.left_px) in page
-    moved = np.where((night.role == "warm_up")[:, None, None], night.centres_px + 400, night.centres_px)
-    (elsewhere,) = collect_numbers(replace(night, centres_px=moved), model, None).warm_ups
+    moved = np.where((recorded.role == "warm_up")[:, None, None], recorded.centres_px + 400, recorded.centres_px)
+    (elsewhere,) = collect_numbers(replace(recorded, centres_px=moved), model, None).warm_ups
     assert np.isnan(elsewhere.left_px).all()
 
 
 def test_the_formula_in_the_report_gives_the_model_s_corrections(analysed: Analysed):
     """The printed coefficients, put into the printed formula, are the model."""
-    night, model, _ = analysed
+    recorded, model, _ = analysed
     formula = collect_numbers(*analysed).model.formula
     points, degC = places_px()[:5], 41.5
-    width, height = night.image_size
+    width, height = recorded.image_size
     low, high = model.facts.camera_range_degC
     i, j = 2 * (points[:, 0] + 0.5) / width - 1, 2 * (points[:, 1] + 0.5) / height - 1
     t = (2 * degC - (low + high)) / (high - low)
     cosine = np.polynomial.chebyshev.Chebyshev.basis
-    said = points.copy()
+    message = points.copy()
     for name, coefficients in zip(formula.terms, formula.coefficients_px, strict=True):
         a, b, c = map(int, re.fullmatch(r"T(\d)\(i\) T(\d)\(j\) T(\d)\(t\)", name).groups())
-        said += coefficients * (cosine(a)(i) * cosine(b)(j) * cosine(c)(t))[:, None]
-    np.testing.assert_allclose(said, model.correct(points, degC), atol=1e-9)
+        message += coefficients * (cosine(a)(i) * cosine(b)(j) * cosine(c)(t))[:, None]
+    np.testing.assert_allclose(message, model.correct(points, degC), atol=1e-9)
     assert formula.sigma_px.shape == formula.coefficients_px.shape
     assert f"/ {width} − 1" in formula.lines[2]
 
@@ -391,15 +391,15 @@ def test_the_residuals_have_a_scale_of_their_own():
     assert 0.5 < scale * 0.005 / (0.06 * 2448) <= 1
 
 
-def test_doubtful_frames_are_named_when_they_are_more_than_noise_alone_gives(numbers: ReportNumbers):
+def test_suspect_frames_are_named_when_they_are_more_than_noise_alone_gives(numbers: ReportNumbers):
     """1 of 200 frames of noise alone is doubtful."""
 
-    def says_doubtful(frames: int, doubtful: int) -> bool:
+    def names_suspects(frames: int, suspect: int) -> bool:
         (session, *_) = numbers.sessions
-        own = replace(numbers, sessions=(replace(session, frames=frames, doubtful=doubtful),), unusable=())
+        own = replace(numbers, sessions=(replace(session, frames=frames, suspect=suspect),), unusable=())
         return "frames are not described by" in render_numbers(own)
 
-    assert [says_doubtful(*case) for case in ((60, 1), (60, 2), (1000, 20), (1000, 21))] == [False, True, False, True]
+    assert [names_suspects(*case) for case in ((60, 1), (60, 2), (1000, 20), (1000, 21))] == [False, True, False, True]
 
 
 # What a report says of the devices that measured.
@@ -426,7 +426,7 @@ def test_a_sensor_stands_with_its_certificate_and_uncertainty(sensor: str, text:
     assert ("Thermometer channels", f"{text}, laboratory") in list_equipment(session)
 
 
-def test_devices_stand_with_what_they_said_of_themselves_and_other_cameras_do_not() -> None:
+def test_devices_are_listed_with_what_they_reported_of_themselves_and_other_cameras_are_not() -> None:
     cameras = [
         identity("camera", "Basler", "a2A", "40001", lens="25 mm"),
         identity("left", "Basler", "a2A", "7", lens=""),
@@ -483,23 +483,23 @@ def powered(on_ns: list[int]) -> ThermalHistory:
 
 
 def test_the_drift_is_measured_from_the_reference_or_else_from_the_first_frame():
-    night = observations(quadratic)
+    recorded = observations(quadratic)
     cold = observations(quadratic, fit_degC=(10.0, 24.0), held_out_degC=(), session=facts("cold"))
     cold = replace(cold, role=np.array(["warm_up"] * 12))
-    moved = compute_displacement_px(concatenate([night, cold]))
+    moved = compute_displacement_px(concatenate([recorded, cold]))
     np.testing.assert_allclose(moved[:8], 0, rtol=0, atol=1e-9)
     assert np.abs(moved[-1]).max() < 1e-9  # 24 degC, as in its first frame
-    expected = quadratic(night.centres_px[0], -14.0) - night.centres_px[0]
+    expected = quadratic(recorded.centres_px[0], -14.0) - recorded.centres_px[0]
     np.testing.assert_allclose(moved[-3], expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("role", [Role.CALIBRATION, Role.POSE, Role.REPEATABILITY, Role.OTHER])
 def test_a_target_that_was_moved_on_purpose_is_no_drift(role: Role):
-    night = observations(quadratic)
-    centres, roles = night.centres_px.copy(), night.role.astype("U16")
+    recorded = observations(quadratic)
+    centres, roles = recorded.centres_px.copy(), recorded.role.astype("U16")
     centres[10:13] += 28.0
     roles[10:13] = str(role)
-    moved = compute_displacement_px(replace(night, centres_px=centres, role=roles))
+    moved = compute_displacement_px(replace(recorded, centres_px=centres, role=roles))
     assert np.isnan(moved[10:13]).all()
     assert np.nanmax(np.abs(moved)) < 2
 
@@ -516,10 +516,10 @@ def test_a_warm_up_of_a_rolled_camera_is_measured_from_its_own_first_frame():
 
 
 def test_a_warm_up_rolled_before_the_reference_of_its_session_does_not_jump():
-    night, rolled = observations(quadratic), warm_up("x", 20.0)
-    roles = np.concatenate([np.array(["warm_up"] * 4), night.role[4:]])
-    centres = np.concatenate([rolled.centres_px[:4], night.centres_px[4:]])
-    assert np.nanmax(np.abs(compute_displacement_px(replace(night, role=roles, centres_px=centres)))) < 2
+    recorded, rolled = observations(quadratic), warm_up("x", 20.0)
+    roles = np.concatenate([np.array(["warm_up"] * 4), recorded.role[4:]])
+    centres = np.concatenate([rolled.centres_px[:4], recorded.centres_px[4:]])
+    assert np.nanmax(np.abs(compute_displacement_px(replace(recorded, role=roles, centres_px=centres)))) < 2
 
 
 def test_a_warm_up_is_timed_from_when_the_camera_was_switched_on():
@@ -536,10 +536,10 @@ def test_a_warm_up_is_timed_from_when_the_camera_was_switched_on():
 
 
 def test_visits_know_from_which_side_they_were_reached():
-    night = observations(quadratic, fit_degC=(31.0, 38.0, 31.0, 10.0), held_out_degC=())
-    track = find_cycle(night, 0)
+    recorded = observations(quadratic, fit_degC=(31.0, 38.0, 31.0, 10.0), held_out_degC=())
+    track = find_cycle(recorded, 0)
     assert track is not None
-    found = list_visits(night, track)
+    found = list_visits(recorded, track)
     assert [(one.chamber_degC, one.direction) for one in found] == [(24, 0), (31, 1), (38, 1), (31, -1), (10, -1)]
     expected = (quadratic(places_px(), 14.0) - places_px()).mean(axis=0)
     np.testing.assert_allclose(found[2].mean_px, expected, atol=1e-9)
@@ -552,12 +552,12 @@ def test_thinning_keeps_the_ends():
 
 
 def test_figures_bear_missing_frames_and_temperatures():
-    night = observations(quadratic, 0.005)
-    centres, air = night.centres_px.copy(), night.air_degC.copy()
+    recorded = observations(quadratic, 0.005)
+    centres, air = recorded.centres_px.copy(), recorded.air_degC.copy()
     centres[3] = np.nan
     centres[:, 5] = np.nan
     air[:] = np.nan
-    holes = replace(night, centres_px=centres, air_degC=air)
+    holes = replace(recorded, centres_px=centres, air_degC=air)
     assert np.isnan(compute_displacement_px(holes)[3]).all()
     track = find_cycle(holes, 0)
     assert track is not None
@@ -567,14 +567,14 @@ def test_figures_bear_missing_frames_and_temperatures():
 
 
 def test_what_a_thermal_imager_saw_stands_beneath_the_drift():
-    night = observations(quadratic, 0.005)
-    times_ns = np.linspace(night.time_ns[0] - 10**12, night.time_ns[-1] + 10**12, 1000).astype(np.int64)
+    recorded = observations(quadratic, 0.005)
+    times_ns = np.linspace(recorded.time_ns[0] - 10**12, recorded.time_ns[-1] + 10**12, 1000).astype(np.int64)
     spots = {"lens": (times_ns, np.linspace(30.0, 50.0, 1000)), "back": (times_ns, np.full(1000, np.nan))}
-    without, seen = night, replace(night, sessions=(replace(facts(), spots=spots),))
+    without, seen = recorded, replace(recorded, sessions=(replace(facts(), spots=spots),))
     assert len(report_figures.draw_against_time(without).axes) == 2
     *_, foot = report_figures.draw_against_time(seen).axes
     lens, _ = foot.lines
-    hours = (night.time_ns[-1] - night.time_ns[0]) / 3.6e12
+    hours = (recorded.time_ns[-1] - recorded.time_ns[0]) / 3.6e12
     shown = np.asarray(lens.get_xdata(), np.float64)
     assert 0 <= shown[0] < 0.01 * hours
     assert 0.99 * hours < shown[-1] <= hours

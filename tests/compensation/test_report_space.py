@@ -65,7 +65,7 @@ def validation() -> SpatialValidation:
         with_stand=None,
         lens="pinhole",
         model="thermal: homography",
-        session_id="night-2",
+        session_id="cycle-2",
         simulated=True,
     )
 
@@ -128,9 +128,9 @@ def test_no_file_and_no_json_are_refused_with_a_sentence(tmp_path: Path):
 
 
 def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validation: SpatialValidation):
-    night = observations(quadratic, 0.005)
+    session = observations(quadratic, 0.005)
     extras = Extras(positions=TablePositions(((0.0, 0.0), (90.0, 15.0)), PLACES), validation=validation)
-    page = render_report(night, None, None, extras)
+    page = render_report(session, None, None, extras)
     before, after = validation.before.mean_um, validation.after.mean_um
     assert page.count("<td>142.0</td><td>28.7</td><td>80 %</td>") == 2  # first of all, and in its section
     assert page.count(f"<td>{before[2]:.1f}</td><td>{after[2]:.2f}</td>") == 2
@@ -139,17 +139,17 @@ def test_the_report_has_table_1_and_figure_15_when_a_validation_is_given(validat
     assert "<td>0.0298</td><td>0.2126</td><td>0.2326</td>" in page  # the paper's Table 1
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
-    numbers = collect_numbers(night, None, None, extras)
+    numbers = collect_numbers(session, None, None, extras)
     assert isinstance(numbers.validation, dict)
     assert numbers.validation["results"][1]["mean_um"] == after.tolist()
     assert numbers.positions.poses == PLACES
 
 
 def test_a_target_that_never_moved_has_no_such_section():
-    night = observations(quadratic, 0.005)
-    night = replace(night, role=np.full(len(night.role), "calibration"))
-    assert "In three dimensions" not in render_report(night, None, None)
-    drawn = render_report(night, None, None, Extras(positions=TablePositions(poses=PLACES)))
+    session = observations(quadratic, 0.005)
+    session = replace(session, role=np.full(len(session.role), "calibration"))
+    assert "In three dimensions" not in render_report(session, None, None)
+    drawn = render_report(session, None, None, Extras(positions=TablePositions(poses=PLACES)))
     assert drawn.count("<svg") == 1
     assert "In three dimensions" in drawn
     assert "Table 1" not in drawn

@@ -91,7 +91,7 @@ def test_a_point_projected_with_the_new_camera_matrix_is_seen_where_the_drift_pu
     np.testing.assert_allclose(np.array(now.k).reshape(3, 3)[0], matrix[0], atol=1e-12)
 
 
-def test_what_is_unknown_is_said_and_camera_info_passes_unchanged(node: StubNode):
+def test_what_is_unknown_is_reported_and_camera_info_passes_unchanged(node: StubNode):
     info = MESSAGES["sensor_msgs"]["CameraInfo"](k=K.ravel().tolist())
     node.send("camera_info_raw", info)
     assert node.published["camera_info"][-1].k == K.ravel().tolist()

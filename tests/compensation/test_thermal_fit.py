@@ -38,13 +38,13 @@ Seen = tuple[Observations, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def night() -> Seen:
+def recorded() -> Seen:
     return session(warm_up(24.0) + reference() + cycle())
 
 
 @pytest.fixture(scope="module")
-def thermal(night: Seen) -> ThermalModel:
-    return fit_thermal(night[0])
+def thermal(recorded: Seen) -> ThermalModel:
+    return fit_thermal(recorded[0])
 
 
 def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: np.ndarray | None = None) -> float:
@@ -58,28 +58,28 @@ def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: np.ndarray
 
 
 def test_a_polynomial_of_the_temperature_is_limited_by_the_lag_and_the_thermal_form_is_not(
-    night: Seen, thermal: ThermalModel
+    recorded: Seen, thermal: ThermalModel
 ):
     for degree in (2, 4):
-        assert left_mpx(fit_paper(night[0], degree), night, Role.VALIDATION) > 8.0
-    assert left_mpx(thermal, night, Role.VALIDATION) <= 2.0
+        assert left_mpx(fit_paper(recorded[0], degree), recorded, Role.VALIDATION) > 8.0
+    assert left_mpx(thermal, recorded, Role.VALIDATION) <= 2.0
 
 
-def test_what_is_asked_for_without_a_form_is_the_one_that_predicts_better(night: Seen):
-    model = fit(night[0])
+def test_what_is_asked_for_without_a_form_is_the_one_that_predicts_better(recorded: Seen):
+    model = fit(recorded[0])
     assert model.form == "thermal"
     assert {one.form for one in model.candidates} == {"paper", "thermal"}
     assert [one.form for one in model.candidates if one.chosen] == ["thermal"]
     assert model.other is not None
-    np.testing.assert_array_equal(getattr(model.other, "coefficients", None), fit_paper(night[0]).coefficients)
-    asked = fit(night[0], degree=2)
+    np.testing.assert_array_equal(getattr(model.other, "coefficients", None), fit_paper(recorded[0]).coefficients)
+    asked = fit(recorded[0], degree=2)
     assert (asked.form, asked.other and asked.other.form) == ("paper", "thermal")
     alone = fit(without_histories(quadratic, 0.005))
     assert (alone.form, alone.other) == ("paper", None)
 
 
-def test_forms_that_are_as_good_at_rest_are_chosen_by_frames_that_were_not(night: Seen, thermal: ThermalModel):
-    paper = fit(night[0]).other
+def test_forms_that_are_as_good_at_rest_are_chosen_by_frames_that_were_not(recorded: Seen, thermal: ThermalModel):
+    paper = fit(recorded[0]).other
     assert isinstance(paper, PaperModel)
     alike = replace(paper, candidates=tuple(one.model_copy(update=AT_REST) for one in paper.candidates))
     own = replace(thermal, candidates=tuple(one.model_copy(update=AT_REST) for one in thermal.candidates))
@@ -94,7 +94,7 @@ def test_forms_that_are_as_good_at_rest_are_chosen_by_frames_that_were_not(night
 
 @pytest.mark.parametrize("air_degC", [15.0, 34.0])
 def test_a_warm_up_elsewhere_is_predicted_when_one_was_recorded_and_not_otherwise(
-    night: Seen, thermal: ThermalModel, air_degC: float
+    recorded: Seen, thermal: ThermalModel, air_degC: float
 ):
     elsewhere = session(reference() + warm_up(air_degC), seed=3)
     assert left_mpx(thermal, elsewhere, Role.WARM_UP) <= 3.0
@@ -114,17 +114,17 @@ def test_plays_help_a_camera_with_play_and_are_not_taken_for_one_without(thermal
     assert left_mpx(model, loose, Role.VALIDATION) <= 15.0
 
 
-def test_the_95_percent_interval_holds_95_percent_at_held_out_temperatures(night: Seen, thermal: ThermalModel):
-    found = evaluate(thermal, night[0])
+def test_the_95_percent_interval_holds_95_percent_at_held_out_temperatures(recorded: Seen, thermal: ThermalModel):
+    found = evaluate(thermal, recorded[0])
     for part in found.coverage_95:
         assert part >= 0.92
     claimed_px = np.sqrt(found.claimed_px2.mean())
     assert claimed_px < 1.4 * np.sqrt((found.after_px**2).mean())  # the markers' own noise is most of it
 
 
-def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night: Seen, thermal: ThermalModel):
-    states = compute_frame_states(night[0], thermal.memory)
-    usual = states.where(np.flatnonzero(night[0].of(Role.FIT))[:1])
+def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(recorded: Seen, thermal: ThermalModel):
+    states = compute_frame_states(recorded[0], thermal.memory)
+    usual = states.where(np.flatnonzero(recorded[0].of(Role.FIT))[:1])
     hot = States(usual.memory, usual.rows + np.where(np.arange(usual.rows.shape[1]) == 0, 60.0, 0.0))
     points = np.array([[1200.0, 1000.0], [2200.0, 1600.0]])
     near, far = thermal.covariance(points, usual), thermal.covariance(points, hot)
@@ -133,9 +133,9 @@ def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(night:
     assert (np.trace(far, axis1=1, axis2=2) > 10 * np.trace(near, axis1=1, axis2=2)).all()
 
 
-def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
-    inside = night[0].of(Role.FIT, Role.VALIDATION, Role.WARM_UP)
-    states = compute_frame_states(night[0], thermal.memory)
+def test_what_was_not_calibrated_is_flagged(recorded: Seen, thermal: ThermalModel):
+    inside = recorded[0].of(Role.FIT, Role.VALIDATION, Role.WARM_UP)
+    states = compute_frame_states(recorded[0], thermal.memory)
     point = np.array([[1200.0, 1000.0]])
     assert not any(thermal.flags(point, states.where(np.array([k])))[0] for k in np.flatnonzero(inside))
     usual = states.where(np.flatnonzero(inside)[-1:])
@@ -158,8 +158,8 @@ def test_what_was_not_calibrated_is_flagged(night: Seen, thermal: ThermalModel):
             ask(point, 45.0)
 
 
-def test_the_same_correction_comes_live_and_from_the_recording(night: Seen, thermal: ThermalModel):
-    record = night[0].histories[0]
+def test_the_same_correction_comes_live_and_from_the_recording(recorded: Seen, thermal: ThermalModel):
+    record = recorded[0].histories[0]
     end = 2000
     state = make_initial_state(thermal.memory)
     camera_degC = np.interp(record.ambient_ns, record.camera_ns, record.camera_degC)
@@ -204,47 +204,47 @@ def test_a_thermal_model_is_read_back_number_for_number(thermal: ThermalModel, t
         load_model(tmp_path / "model.json")
 
 
-def test_what_the_thermal_form_needs_is_reported(night: Seen):
+def test_what_the_thermal_form_needs_is_reported(recorded: Seen):
     with pytest.raises(SessionError, match="history of the air"):
         fit(without_histories(quadratic), form="thermal")
     with pytest.raises(ConfigError, match="has no degree"):
-        fit(night[0], degree=3, form="thermal")
-    silent = replace(night[0], air_degC=np.full(len(night[0].frame), np.nan))
+        fit(recorded[0], degree=3, form="thermal")
+    silent = replace(recorded[0], air_degC=np.full(len(recorded[0].frame), np.nan))
     with pytest.raises(SessionError, match="no air temperature"):
         fit_thermal(silent)
 
 
-def test_a_night_that_only_one_form_can_be_fitted_to_has_that_form_and_says_what_the_other_lacks():
+def test_a_session_that_only_one_form_can_be_fitted_to_has_that_form_and_says_what_the_other_lacks():
     """Two set-points are too few for a polynomial; frames on the way to others teach the thermal form."""
     way = [Part(air_degC, 2700, role="warm_up", frames=6, interval_s=300) for air_degC in (34.0, 17.0)]
     observed = session([*reference(), way[0], Part(45.0, 2700, role="fit", frames=5), way[1]])[0]
-    said: list[str] = []
-    model = fit(observed, say=said.append)
+    messages: list[str] = []
+    model = fit(observed, say=messages.append)
     assert (model.form, model.other) == ("thermal", None)
-    (sentence,) = said
+    (sentence,) = messages
     assert sentence.startswith("the paper form")
     with pytest.raises(SessionError, match="at 3 chamber temperatures"):
         fit(observed, form="paper")
 
 
-# What another night adds: assumed of one night, and known better with each that is compared.
+# What another session adds: assumed of one session, and known better with each that is compared.
 
 
 NONE_PX2 = np.zeros((0, 2))
 
 
-def test_of_one_night_it_is_assumed_and_says_so():
+def test_of_one_session_it_is_assumed_and_says_so():
     found = estimate_between_sessions(np.array([0.0, 0.010]), NONE_PX2)
     assert found.is_assumed
     assert "assumed, not measured" in found.text
-    # Four nights' worth: Student's t of 4 degrees of freedom reaches 2.776 where a normal distribution reaches 1.960.
+    # Four sessions' worth: Student's t of 4 degrees of freedom reaches 2.776 where a normal distribution reaches 1.960.
     assert found.sigma_px == pytest.approx((0.002 * 2.776 / 1.96, np.hypot(0.002, 0.008) * 2.776 / 1.96), rel=1e-3)
 
 
-def test_nights_that_agree_make_it_smaller_and_nights_that_do_not_larger():
+def test_sessions_that_agree_make_it_smaller_and_sessions_that_do_not_larger():
     left_px = np.array([0.004, 0.004])
     agreeing = [
-        estimate_between_sessions(left_px, np.full((nights, 2), left_px**2)).sigma_px[0] for nights in (0, 2, 4, 12)
+        estimate_between_sessions(left_px, np.full((sessions, 2), left_px**2)).sigma_px[0] for sessions in (0, 2, 4, 12)
     ]
     assert agreeing == sorted(agreeing, reverse=True)
     assert agreeing[-1] < 0.5 * agreeing[0]
@@ -255,8 +255,8 @@ def test_nights_that_agree_make_it_smaller_and_nights_that_do_not_larger():
     assert "as 2 sessions show" in found.text
 
 
-def test_with_many_nights_it_is_what_they_show():
-    """Nights that differ by 10 mpx, one standard deviation."""
+def test_with_many_sessions_it_is_what_they_show():
+    """Sessions that differ by 10 mpx, one standard deviation."""
     rng = np.random.default_rng(1)
     left_px2 = 0.003**2 + (0.010 * rng.standard_normal((400, 2))) ** 2
     assert estimate_between_sessions(np.full(2, 0.003), left_px2).sigma_px == pytest.approx((0.010, 0.010), rel=0.1)

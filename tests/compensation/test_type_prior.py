@@ -40,7 +40,7 @@ def few() -> DrawnSession:
 
 
 def left_mpx(model: ThermalModel) -> tuple[float, float]:
-    """RMS of both coordinates on another night of the new unit, and the share that the 95 % interval holds."""
+    """RMS of both coordinates on another session of the new unit, and the share that the 95 % interval holds."""
     asked = seen(NEW, fitted_degC=(), asked_degC=(34, 48, 20, 13), seed=2)
     at_reference_px = asked.truth_px[asked.observed.of(Role.REFERENCE)].mean(axis=0)
     states = compute_frame_states(asked.observed, model.memory)
@@ -52,7 +52,9 @@ def left_mpx(model: ThermalModel) -> tuple[float, float]:
     return 1e3 * float(np.hypot(*compute_rms_px(deviation))) / 2**0.5, held
 
 
-def test_two_temperatures_and_the_type_come_near_to_a_whole_night(units: list[ThermalModel], few: DrawnSession) -> None:
+def test_two_temperatures_and_the_type_come_near_to_a_whole_session(
+    units: list[ThermalModel], few: DrawnSession
+) -> None:
     own, of_type = fit_like(few.observed, units), units[0]
     left, held = left_mpx(own)
     assert left < 25 < 0.5 * left_mpx(of_type)[0]

@@ -54,7 +54,7 @@ def test_the_report_says_so(tmp_path: Path) -> None:
     write_report(tmp_path / "report.html", observed, model, evaluate(model, observed))
     assert "sticks and slips" in (tmp_path / "report.html").read_text()
     (reported,) = json.loads((tmp_path / "report.json").read_text())["unrepeated"]
-    assert (reported["cause"], reported["session_id"]) == ("slips", "night-1")
+    assert (reported["cause"], reported["session_id"]) == ("slips", "cycle-1")
     assert reported["along_px"] > 0.003
 
 

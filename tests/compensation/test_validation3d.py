@@ -198,7 +198,7 @@ def test_corrections_beyond_the_models_range_are_flagged(
     assert not np.any(validated.flags & Outside.CAMERA)
 
 
-def test_table_figures_and_document_show_the_papers_beside_ours(validated: SpatialValidation):
+def test_table_figures_and_document_compare_ours_with_the_papers(validated: SpatialValidation):
     text = format_summary(validated)
     assert "paper, after" in text
     assert text.splitlines()[3].split() == ["paper,", "after", "12.4", "25.4", "28.7"]
@@ -227,7 +227,7 @@ def test_the_papers_averages_are_those_of_its_own_table():
 def file(laboratory: Laboratory) -> CameraFile:
     found = calibrate(positions(laboratory), target_of(laboratory), TABLE, Model.BROWN)
     return build_camera_file(
-        found, camera_serial="TS-0001", session_ids=("night-2",), target_name="paper-9x6", software_version="0"
+        found, camera_serial="TS-0001", session_ids=("cycle-2",), target_name="paper-9x6", software_version="0"
     )
 
 

@@ -82,7 +82,7 @@ def published(index: int, time_ns: int, silent: str) -> Iterator[Item]:
 
 
 async def record(directory: Path, visits: int = len(VISITS), silent: str = "") -> None:
-    how = {"session_id": "night-2", "recipe": "validation", "attachments": {"target.yaml": TARGET_YAML}}
+    how = {"session_id": "cycle-2", "recipe": "validation", "attachments": {"target.yaml": TARGET_YAML}}
     await record_items(directory, partial(published, silent=silent), visits, 30, **how)
 
 
@@ -120,7 +120,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asyncio.run(record(folder / "session"))
     found = calibrate(calibration_positions(), TARGET, TableSigma(), Model.BROWN)
     build_camera_file(
-        found, camera_serial="TS-0001", session_ids=("night-2",), target_name="small", software_version="0"
+        found, camera_serial="TS-0001", session_ids=("cycle-2",), target_name="small", software_version="0"
     ).save(folder / "camera.json")
     save_model(fit_paper(cycle(), 1), folder / "model.json")
     geometry = load_geometry("paper").model_copy(update={"focal_px": F_px, "image_px": SIZE})
@@ -133,7 +133,7 @@ def run(folder: Path, session: Path, out: Path, *options: str) -> Result:
     return CliRunner().invoke(cli.app, ["validate", str(session), *files, "-o", str(out), *options])
 
 
-def test_validate_writes_the_page_and_the_numbers_beside_it(folder: Path, tmp_path: Path):
+def test_validate_writes_the_page_and_the_numbers_next_to_it(folder: Path, tmp_path: Path):
     result = run(folder, folder / "session", tmp_path / "validation.html", "--budget", str(folder / "small.yaml"))
     assert result.exit_code == 0, result.output
     assert "paper, after" in result.stdout

@@ -54,13 +54,13 @@ def test_windows_end_at_the_edges_of_the_image():
     assert (windows[:, :2] + windows[:, 2:] <= image.shape[::-1]).all()
 
 
-def test_without_one_marker_there_are_no_windows():
+def test_without_one_marker_no_windows_are_made():
     scene = dataclasses.replace(HALF, missing=(30,))
     assert find_marker_windows(photograph(scene, render(scene), 1), PAPER) is None
 
 
 @pytest.mark.parametrize("level_DN", [3, 120, 255])
-def test_in_an_even_image_there_are_no_windows(level_DN):
+def test_an_even_image_has_no_windows(level_DN):
     assert find_marker_windows(np.full((512, 612), level_DN, np.uint8), PAPER) is None
 
 

@@ -82,7 +82,7 @@ def _observations(centres_px: Float, chamber_degC: Float, noise_px: float) -> Ob
     count = len(centres_px)
     return Observations(
         target=TARGET,
-        sessions=(facts("night-2"),),
+        sessions=(facts("cycle-2"),),
         image_size=SIZE,
         preview=np.full((682, 816), 200, np.uint8),
         session=np.zeros(count, np.int64),

@@ -1,4 +1,4 @@
-"""The far end of a serial bus, which answers as it is told to."""
+"""The far end of a serial bus, which answers as it is reported to."""
 
 from __future__ import annotations
 

@@ -152,8 +152,8 @@ def texts(kind: Literal["hart", "vaisala"]) -> Parser:
         return {channel: None if isnan(value) else value for channel, value in values.items()}
 
     def answer(number: int, heard: bytes) -> Any:
-        told = probe._parse_reply(heard)
-        found = None if told is None else {channel.name: value for channel, value in told.items()}
+        parsed = probe._parse_reply(heard)
+        found = None if parsed is None else {channel.name: value for channel, value in parsed.items()}
         return None if found is None else plain(found)
 
     def between(line: str, word: str, unit: str) -> float | str | None:

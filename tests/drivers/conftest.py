@@ -82,7 +82,7 @@ def responder() -> Responder:
 
 @pytest.fixture
 async def bus(responder: Responder, tmp_path: Path) -> AsyncIterator[Bus]:
-    """A bus whose far end answers as it is told to."""
+    """A bus whose far end answers as it is reported to."""
     wire = PtyWire(tmp_path / "rs485", responder, LinkFaults())
     bus = Bus("rs485", BusSettings(address=f"serial:{tmp_path / 'rs485'}", timeout_s=TIMEOUT_S, gap_s=0.0), WallClock())
     await bus.open()

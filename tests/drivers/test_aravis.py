@@ -22,7 +22,7 @@ def test_a_missing_library_names_the_package_to_install():
         load(("libnowhere.so.1", "libnowhere.so.2"), "libnowhere1")
 
 
-def test_the_first_library_that_is_there_is_taken():
+def test_the_first_installed_library_is_taken():
     assert load(("libnowhere.so.1", "libc.so.6"), "libc6")
 
 

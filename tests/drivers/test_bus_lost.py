@@ -18,7 +18,7 @@ from thermostand.foundation.errors import GarbledReply, Unreachable
 
 
 class MbapResponder(Responder):
-    """The same behind a Modbus TCP gateway, which changes each reply as it is told to."""
+    """The same behind a Modbus TCP gateway, which changes each reply as it is reported to."""
 
     change: Fault | None = None
 
@@ -146,7 +146,7 @@ async def test_a_gateway_that_closes_after_each_reply_is_read_and_written() -> N
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "sentence"),
     [
         (numberless, "the gateway returned transaction number 0 for 1; is it set to Modbus TCP?"),
         (of_another_unit, "unit 2 answered where unit 1 was asked"),
@@ -154,10 +154,10 @@ async def test_a_gateway_that_closes_after_each_reply_is_read_and_written() -> N
     ],
 )
 async def test_over_tcp_a_reply_to_another_request_is_refused_by_what_is_wrong_with_it(
-    change: Fault, said: str
+    change: Fault, sentence: str
 ) -> None:
     async with behind_gateway(LinkFaults(), change) as (bus, _):
-        with pytest.raises(GarbledReply, match=re.escape(said)):
+        with pytest.raises(GarbledReply, match=re.escape(sentence)):
             await bus.write_coil("dut", 1, 3, 0xFF00)
 
 

@@ -245,7 +245,7 @@ def test_whether_it_is_the_selector_alone_that_is_not_answered_for_decides(code:
         find_temperature(cast("GigeDevice", Asked(5, others=5)), wanted)
 
 
-async def test_a_rate_of_the_cameras_own_choice_is_switched_off_once_the_rate_is_there():
+async def test_a_rate_of_the_cameras_own_choice_is_switched_off_once_the_rate_exists():
     """As Point Grey's: the automatic is offered with the rate enabled only."""
     automatic = choice(
         "AcquisitionFrameRateAuto",

@@ -251,7 +251,7 @@ def test_a_cts_frame_is_that_of_the_manual(text: str, frame: str):
     assert unwrap_frame(1, bytes.fromhex(frame)) == text
 
 
-def test_an_ascii_2_reply_is_read_whole_in_pieces_and_not_beside_it():
+def test_an_ascii_2_reply_is_read_whole_in_pieces_and_not_misaligned():
     line = b"0050.0 0024.6 0080.0 0066.7 0090.0 0090.0 -040.0 0023.8 01100000000000000000000000000000\r"
     found = parse(line)
     assert found is not None

@@ -84,7 +84,7 @@ async def test_what_was_changed_at_the_panel_is_reported_with_both_values_and_le
 
 
 @pytest.mark.parametrize(
-    ("make", "code", "said"),
+    ("make", "code", "sentence"),
     [
         ("espec", "5", "alarm 5"),
         ("cts", "33", "error 33"),
@@ -93,13 +93,13 @@ async def test_what_was_changed_at_the_panel_is_reported_with_both_values_and_le
     ],
 )
 async def test_a_latched_alarm_is_reported_and_nothing_is_started_until_it_is_reset(
-    make: str, code: str, said: str, tmp_path: Path
+    make: str, code: str, sentence: str, tmp_path: Path
 ):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.alarm = code
-        assert (await bench.read())["fault"].reason == said
-        with pytest.raises(DeviceFault, match=f"{said}; look at the chamber"):
+        assert (await bench.read())["fault"].reason == sentence
+        with pytest.raises(DeviceFault, match=f"{sentence}; look at the chamber"):
             await bench.driver.run()
         assert not bench.fake.running
         bench.fake.alarm = ""
@@ -116,14 +116,14 @@ async def test_a_set_point_that_is_clamped_is_refused_by_what_it_reads(make: str
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "sentence"),
     [("espec", "DATA OUT OF RANGE"), ("simserv", "does not take these parameters"), ("julabo", "VALUE TOO LARGE")],
 )
-async def test_a_set_point_that_the_unit_refuses_is_reported_in_its_words(make: str, said: str, tmp_path: Path):
+async def test_a_set_point_that_the_unit_refuses_is_reported_in_its_words(make: str, sentence: str, tmp_path: Path):
     async with bench_of(make, "tcp", tmp_path) as bench:
         await bench.driver.open()
         bench.fake.limits_degC = (0.0, 35.0)
-        with pytest.raises(Refused, match=said):
+        with pytest.raises(Refused, match=sentence):
             await bench.driver.set_temperature(50.0)
 
 
@@ -183,7 +183,7 @@ async def test_a_circulator_says_what_it_did_not_take_and_that_is_no_alarm(tmp_p
         assert (await bench.read())["fault"].value == 0
 
 
-IN_FORCE = [  # of which make, with which settings, what acts in the place of the set-point, and what is said of it
+IN_FORCE = [  # of which make, with which settings, what acts in the place of the set-point, and what is reported of it
     ("julabo", {}, {"bank": 1}, "working temperature T2 acts (in_mode_01 is 1), and T1 is set"),
     ("julabo", {}, {"bank": 2}, "working temperature T3 acts"),
     ("julabo", {}, {"external": True}, "external control is on (in_mode_04 is 1)"),
@@ -197,9 +197,9 @@ IN_FORCE = [  # of which make, with which settings, what acts in the place of th
 ]
 
 
-@pytest.mark.parametrize(("make", "settings", "state", "said"), IN_FORCE)
+@pytest.mark.parametrize(("make", "settings", "state", "sentence"), IN_FORCE)
 async def test_a_set_point_that_is_not_the_one_that_acts_is_a_fault_and_is_not_heated_for(
-    make: str, settings: dict[str, object], state: dict[str, object], said: str, tmp_path: Path
+    make: str, settings: dict[str, object], state: dict[str, object], sentence: str, tmp_path: Path
 ):
     async with bench_of(make, "tcp", tmp_path, **settings) as bench:
         await bench.driver.open()
@@ -210,13 +210,13 @@ async def test_a_set_point_that_is_not_the_one_that_acts_is_a_fault_and_is_not_h
             setattr(bench.fake, name, value)
         written = bench.fake.setpoint_writes
         (objection,) = (await bench.driver.in_force()).objections
-        assert said in objection
+        assert sentence in objection
         for call in (bench.driver.set_temperature(40.0), bench.driver.run()):
-            with pytest.raises(DeviceFault, match=f"not in force: .*{re.escape(said)}"):
+            with pytest.raises(DeviceFault, match=f"not in force: .*{re.escape(sentence)}"):
                 await call
         assert (bench.fake.setpoint_writes, bench.fake.running) == (written, False)
         found = await bench.read()
-        assert (found["fault"].value, said in found["fault"].reason) == (1, True)
+        assert (found["fault"].value, sentence in found["fault"].reason) == (1, True)
 
 
 @pytest.mark.parametrize("make", ["julabo", "espec", "simserv", "cts", "ascii2"])

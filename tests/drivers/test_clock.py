@@ -250,7 +250,7 @@ def test_boot_time_is_that_of_the_kernel():
     assert before_ns - to_ns(0.011) <= uptime_ns <= boot_time_ns()  # which is given to 10 ms
 
 
-async def test_what_sleeps_is_woken_also_when_nobody_can_be_told_of_the_time():
+async def test_what_sleeps_is_woken_also_when_nobody_can_be_notified_of_the_time():
     """A run whose simulated laboratory has died ends, and what ends it sleeps."""
 
     async def advance(time_ns: int) -> None:

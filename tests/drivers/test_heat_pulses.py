@@ -16,9 +16,9 @@ SETTINGS = PulsesSettings(cycle_s=20, min_on_s=1, min_off_s=2)
 
 @given(percent=st.floats(0.1, 100))
 def test_over_many_cycles_the_heat_is_the_output(percent: float):
-    owed_s, given_s, cycles = 0.0, 0.0, 400
+    carried_s, given_s, cycles = 0.0, 0.0, 400
     for _ in range(cycles):
-        on_s, owed_s = compute_pulse_s(percent, owed_s, SETTINGS)
+        on_s, carried_s = compute_pulse_s(percent, carried_s, SETTINGS)
         assert on_s == 0 or SETTINGS.min_on_s <= on_s <= SETTINGS.cycle_s - SETTINGS.min_off_s or on_s == 20
         given_s += on_s
     assert abs(given_s / (cycles * SETTINGS.cycle_s) - percent / 100) < 0.001
@@ -72,7 +72,7 @@ async def test_between_the_begins_of_cycles_nothing_is_sent():
     assert await pulses(50, 80, 80, 80, 25, every_s=5.0) == [10, 5]
 
 
-async def test_nothing_is_owed_once_no_heat_is_wanted():
+async def test_no_pulse_time_is_carried_over_once_no_heat_is_wanted():
     """A pulse without a wish for it would be heat without permission."""
     assert await pulses(4, 0, 0) == []
 

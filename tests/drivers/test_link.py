@@ -1,4 +1,4 @@
-"""Byte links over pseudo-terminals and TCP: what comes through, and what is said when nothing does."""
+"""Byte links over pseudo-terminals and TCP: what comes through, and what is reported when nothing does."""
 
 import os
 import socket

@@ -210,7 +210,7 @@ async def test_a_set_point_that_is_not_the_one_that_acts_stops_what_was_started(
 async def test_a_map_that_does_not_say_what_is_in_force_is_known_as_such():
     def without(text: str) -> str:
         document = yaml.safe_load(text)
-        del document["in_force"], document["not_told"]
+        del document["in_force"], document["unverified"]
         return yaml.safe_dump(document)
 
     async with driven(Bench("watlow-f4t"), map_of("watlow-f4t", without)) as regulator:

@@ -59,7 +59,7 @@ def test_both_levels_stay_within_what_heat_can_give():
         (30.0, SP_degC, 7300.0, "no even limit cycle at 45 degC within 7200 s"),
     ],
 )
-def test_what_cannot_be_tuned_is_said(holding_percent: float, measured_degC: float, after_s: float, text: str):
+def test_what_cannot_be_tuned_is_reported(holding_percent: float, measured_degC: float, after_s: float, text: str):
     tuning = relay_tuning.begin(SP_degC, holding_percent, 0)
     assert text in relay_tuning.step(tuning, measured_degC, to_ns(after_s), SETTINGS, LAW).failure
 

@@ -150,7 +150,7 @@ async def test_make_safe_tries_once_more_what_was_not_confirmed(relays: Relays, 
     assert await states(relays) == {"relays.heater_enable": 0, "relays.compressor": 0, "relays.camera_power": 0}
 
 
-async def test_a_board_that_is_not_there_fails_to_open(bus: Bus) -> None:
+async def test_a_missing_board_fails_to_open(bus: Bus) -> None:
     with pytest.raises((Unreachable, Refused), match="unit 9"):
         await Relays("relays", bus, MAP.at_unit(9), CHANNELS).open()
 

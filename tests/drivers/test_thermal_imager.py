@@ -186,7 +186,7 @@ async def test_old_pictures_that_are_copied_into_the_folder_do_not_set_its_clock
     assert readings["clock_offset"].value == pytest.approx(before, abs=2.5)
 
 
-async def test_without_new_pictures_the_last_ones_become_doubtful(bench: Bench) -> None:
+async def test_without_new_pictures_the_last_ones_become_suspect(bench: Bench) -> None:
     await bench.wait(80)
     bench.fake.stopped = True
     readings = await bench.wait(320)
@@ -209,7 +209,7 @@ async def test_a_folder_that_goes_and_comes_is_reported_and_read_again(bench: Be
     assert [len(bench.events(kind)) for kind in ("pictures_lost", "pictures_back", "picture_taken")] == [1, 1, 1]
 
 
-async def test_pictures_from_before_are_of_another_night(tmp_path: Path) -> None:
+async def test_pictures_from_before_are_of_another_session(tmp_path: Path) -> None:
     before = Bench(tmp_path / "imager")
     await before.imager.open()
     await before.wait(80)

@@ -119,12 +119,12 @@ def test_validation_positions_lie_within_the_calibrated_ones():
         assert max(own) <= max(position[axis] for position in calibrated)
 
 
-def test_the_night_fits_between_six_in_the_evening_and_eight_in_the_morning():
+def test_the_session_fits_between_six_in_the_evening_and_eight_in_the_morning():
     priced = price_plan(recipe("overnight").plan(), load_config(find_packaged("", "laboratory")))
     assert 13.0 < sum(step.duration_s for step in priced) / 3600 < 14.0
 
 
-def test_the_night_meets_each_set_point_in_between_once_from_below_and_once_from_above():
+def test_the_session_meets_each_set_point_in_between_once_from_below_and_once_from_above():
     set_points = [24.0, *(step.chamber_degC for step in steps_of("overnight") if isinstance(step, SetTemperature))]
     visits = list(itertools.pairwise(set_points))
     for chamber_degC in (17.0, 24.0, 31.0, 38.0, 45.0):

@@ -1,8 +1,8 @@
-"""`python -m tests.golden make|check [NAME ...]`: what the program gave before its inside was built anew, by value.
+"""`python -m tests.golden make|check [NAME ...]`: what the program gave before its inside was built again, by value.
 
-demo, table: two nights of seed 7 in virtual time, with all that is computed of them. openapi, help: what is offered.
-Numbers are compared to 1e-9; everything else is exact, and each difference is said with its place. The nights take
-minutes. `make` writes openapi and help anew, which change with a reason; a night only when it is named.
+demo, table: two sessions of seed 7 in virtual time, with all that is computed of them. openapi, help: what is offered.
+Numbers are compared to 1e-9; everything else is exact, and each difference is reported with its place. The sessions
+take minutes. `make` writes openapi and help again, which change with a reason; a session only when it is named.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from tests.golden import product
 DATA = Path(__file__).parent / "data"
 _RELATIVE, _ABSOLUTE = 1e-9, 1e-12
 _MOST = 200
-"""Differences that are said of one golden."""
+"""Differences that are reported of one golden."""
 
 
 def demo() -> Any:
-    """The night of `make demo`: readings, steps, frames, report and datasheet."""
+    """The session of `make demo`: readings, steps, frames, report and datasheet."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         session = product.run(folder / "sessions", "demo")
@@ -57,7 +57,7 @@ GOLDENS = SESSIONS | OFFERED
 
 
 def write(name: str, value: Any) -> None:
-    """Keep it: a night packed, what is offered as text, a line each."""
+    """Keep it: a session packed, what is offered as text, a line each."""
     if name in SESSIONS:
         packed = gzip.compress(json.dumps(value, sort_keys=True).encode(), 9, mtime=0)
         (DATA / f"{name}.json.gz").write_bytes(packed)

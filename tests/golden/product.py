@@ -32,7 +32,7 @@ from thermostand.stand.serving.page_routes import PageRoutes
 
 APPS = {"stand": stand, "compensate": compensate}
 _KEPT = 48
-"""Of the values of a channel so many are kept as they are, spread over the night; the others count in sums."""
+"""Of the values of a channel so many are kept as they are, spread over the session; the others count in sums."""
 
 
 def run(folder: Path, recipe: str | Path) -> Path:
@@ -116,8 +116,8 @@ def openapi() -> dict[str, Any]:
 async def _document() -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         desk, port = FakeService(), free_port()
-        rooms = (PageRoutes(PageData(desk.hub, desk.clock, Path(folder), TARGET)),)
-        async with serve_fake(desk, Path(folder, "now"), Interface(Path(folder), port=port, extra_routes=rooms)):
+        routes = (PageRoutes(PageData(desk.hub, desk.clock, Path(folder), TARGET)),)
+        async with serve_fake(desk, Path(folder, "now"), Interface(Path(folder), port=port, extra_routes=routes)):
             return json.loads(await asyncio.to_thread(_get, port, "/openapi.json"))
 
 

@@ -1,4 +1,4 @@
-"""What the program gave before its inside was built anew, it gives now: `python -m tests.golden`."""
+"""What the program gave before its inside was built again, it gives now: `python -m tests.golden`."""
 
 import json
 from typing import Any
@@ -27,5 +27,5 @@ def test_nothing_differs_from_what_is_kept(name: str):
         (True, 1, [""]),
     ],
 )
-def test_each_difference_is_said_with_its_place(before: Any, now: Any, places: list[str]):
+def test_each_difference_is_reported_with_its_place(before: Any, now: Any, places: list[str]):
     assert [each.partition(":")[0] for each in find_differences(before, json.loads(json.dumps(now)))] == places

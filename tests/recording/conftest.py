@@ -1,4 +1,4 @@
-"""A night with a finished segment and one that was not finished in each series, and damaged copies of it."""
+"""A session with a finished segment and one that was not finished in each series, and damaged copies of it."""
 
 import tempfile
 from pathlib import Path
@@ -21,9 +21,9 @@ def memory():
 
 
 @pytest.fixture(scope="module")
-def night(memory):
+def intact(memory):
     """A finished segment and one that was not finished in each series: the directory and what was written where."""
-    directory = memory / "night"
+    directory = memory / "cycle"
     written = {}
     for series, seconds in ((TELEMETRY, 60), (FRAMES, 24)):
         folder = directory / series
@@ -33,12 +33,12 @@ def night(memory):
 
 
 @pytest.fixture
-def damaged(memory, night):
-    """`damaged(series, change, of)`: a copy of the night in which `change(data)` has been done to the part, or to the
+def damaged(memory, intact):
+    """`damaged(series, change, of)`: a copy of the session in which `change(data)` has been done to the part, or to the
     finished segment, and all others are finished; gives its folder, its path and what was written."""
 
     def make(series, change, of="part"):
-        directory, written = night
+        directory, written = intact
         folder = copy_session(directory, memory / "copy") / series
         path = folder / ("0001.mcap.part" if of == "part" else "0000.mcap")
         for part in folder.parent.glob("*/*.part"):

@@ -26,8 +26,8 @@ from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.session_spec import make_readings_topic
 
 START_NS = 1_767_290_400 * NS_PER_S
-METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "Zoë"}
-ATTACHMENTS = {"config.yaml": "camera: {gain_dB: 0.0}\n" * 20, "recipe.yaml": "name: night\n"}
+METADATA = {"format": str(FORMAT), "session_id": "cycle-1", "operator": "Zoë"}
+ATTACHMENTS = {"config.yaml": "camera: {gain_dB: 0.0}\n" * 20, "recipe.yaml": "name: cycle\n"}
 ENCODER = declared_form("thermometers")
 TOPICS = {
     TELEMETRY: (

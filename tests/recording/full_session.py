@@ -19,7 +19,7 @@ from thermostand.recording.writing.recorder import Recorder, RecordingSettings, 
 
 START_NS = 1_767_290_400 * NS_PER_S + 123_456_789
 MS = 1_000_000
-INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "wall", host="laboratory")
+INFO = SessionInfo("cycle-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "wall", host="laboratory")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\r\n"}
 DEVICES = declare_devices({"thermometers": "thermometers", "regulator": "regulator", "camera": "camera"})
 DEVICES |= declare_devices({"rotary": "axis", "linear": "axis"})

@@ -18,7 +18,7 @@ from thermostand.foundation.readings import Frame, Reading, bad_reading
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S
-INFO = SessionInfo("night-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")
+INFO = SessionInfo("cycle-1", "thermal_cycle", "DA1234567", "M. Adamczyk", "0.1.0", "virtual")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n", "target.yaml": "rows: 6  # µm\n"}
 SETTINGS = RecordingSettings(stop_frames_below_bytes=0, alert_below_fraction=0.0)  # whatever this disk has
 DEVICES = declare_devices(

@@ -20,13 +20,13 @@ DAY_NS = 86_400 * 10**9
 
 
 @pytest.fixture(scope="module")
-def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return asyncio.run(record_run(tmp_path_factory.mktemp("nights") / "night"))
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return asyncio.run(record_run(tmp_path_factory.mktemp("cycles") / "cycle"))
 
 
 @pytest.fixture
-def session(night: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(night, tmp_path / "sessions" / "night"))
+def session(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "sessions" / "cycle"))
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_a_copy_is_the_session_and_is_known(session: Path, nas: Path):
     assert look_at(session).archived == ""
     done: list[int] = []
     copy = archive(look_at(session), nas, "eva", 5, done.append)
-    assert copy == nas / "night"
+    assert copy == nas / "cycle"
     assert contents(copy) == contents(session)
     assert sum(done) >= 2 * look_at(session).size_bytes
     assert verify(copy).is_sound
@@ -85,17 +85,17 @@ def test_an_interrupted_copy_goes_on_behind_its_last_file(session: Path, nas: Pa
     with pytest.raises(KeyboardInterrupt):
         archive(look_at(session), nas, "eva", 5)
     monkeypatch.setattr(module, "_copy_file", whole)
-    assert not (nas / "night").exists()
-    first = {path: path.stat().st_ino for path in (nas / "night.part").rglob("*.mcap")}
+    assert not (nas / "cycle").exists()
+    first = {path: path.stat().st_ino for path in (nas / "cycle.part").rglob("*.mcap")}
     assert first
-    (nas / "night.part" / "frames" / ".0003.mcap.copying").write_bytes(b"torn")
+    (nas / "cycle.part" / "frames" / ".0003.mcap.copying").write_bytes(b"part")
     copy = archive(look_at(session), nas, "eva", 6)
     assert contents(copy) == contents(session)
     assert {path.stat().st_ino for path in copy.rglob("*.mcap")} >= set(first.values())
 
 
 def test_what_reads_back_differently_is_no_copy_and_the_next_try_mends_it(session: Path, nas: Path):
-    part = nas / "night.part" / "frames"
+    part = nas / "cycle.part" / "frames"
     part.mkdir(parents=True)
     data = bytearray((session / "frames" / "0001.mcap").read_bytes())
     data[100] ^= 1

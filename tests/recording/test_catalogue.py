@@ -17,14 +17,14 @@ from thermostand.recording.reading.notes import add_note, add_tags
 
 
 @pytest.fixture(scope="module")
-def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return asyncio.run(record_run(tmp_path_factory.mktemp("nights") / "night"))
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return asyncio.run(record_run(tmp_path_factory.mktemp("cycles") / "cycle"))
 
 
 @pytest.fixture
-def folder(night: Path, tmp_path: Path) -> Path:
+def folder(recorded: Path, tmp_path: Path) -> Path:
     for name in ("a", "b", "c"):
-        shutil.copytree(night, tmp_path / name)
+        shutil.copytree(recorded, tmp_path / name)
     (tmp_path / "no-session").mkdir()
     return tmp_path
 

@@ -21,7 +21,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S
-INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
+INFO = SessionInfo("cycle-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
 SETTINGS = RecordingSettings("raw", segment_s=2.0, stop_frames_below_bytes=0, alert_below_fraction=0.0)
 DEVICES = declare_devices({"thermometers": "thermometers"})

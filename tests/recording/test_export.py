@@ -186,7 +186,7 @@ async def test_its_readme_says_how_a_text_was_changed_and_what_was_recorded_can_
     assert state["pv_degC"] == "-1.5"  # a number is no formula
 
 
-async def test_steps_events_metadata_and_attachments_are_there(tmp_path):
+async def test_steps_events_metadata_and_attachments_are_exported(tmp_path):
     session, out = await export_session(tmp_path, count=2, frames=False, telemetry=None)
     assert sorted(path.name for path in out.iterdir()) == [
         "README.txt",

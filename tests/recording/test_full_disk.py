@@ -19,7 +19,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
 START_NS = 1_767_290_400 * NS_PER_S
-INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
+INFO = SessionInfo("cycle-1", "warm_up", "DA1234567", "", "0.1.0", "virtual")
 SMALL_SEGMENTS = RecordingSettings("raw", segment_bytes=8_000_000, stop_frames_below_bytes=0, alert_below_fraction=0.0)
 
 
@@ -29,7 +29,7 @@ def disk(tmp_path):
         yield folder
 
 
-class Night:
+class RecordedRun:
     """A recorder on a virtual clock; each second one frame of 1 MB and one event are published."""
 
     def __init__(self, directory, settings):
@@ -82,34 +82,34 @@ def readable_blocks(directory):
             yield message.sequence
 
 
-def lost_blocks(night):
+def lost_blocks(recorded):
     """The block ids that the events name."""
-    for blocks in list_reported_blocks(night.events):
+    for blocks in list_reported_blocks(recorded.events):
         yield from blocks
 
 
 async def test_a_full_disk_loses_no_frame_it_has_acknowledged_and_no_telemetry(disk):
-    async with Night(disk / "s", SMALL_SEGMENTS) as night:
-        await night.seconds(60)
-        full = night.recorder.saved
+    async with RecordedRun(disk / "s", SMALL_SEGMENTS) as recorded:
+        await recorded.seconds(60)
+        full = recorded.recorder.saved
         assert 45 <= full.frames <= 51  # 67 MB, 16 of them the telemetry's
         assert full.frames + full.frames_lost == 60
         assert sorted(readable_blocks(disk / "s")) == list(range(full.frames))
         assert full.telemetry >= 60 * 2  # the frame's description, the event, and its log message
-        await night.seconds(20)
-        assert night.recorder.saved.frames == full.frames
+        await recorded.seconds(20)
+        assert recorded.recorder.saved.frames == full.frames
         for path in sorted((disk / "s" / "frames").glob("*.mcap"))[:2]:
             path.unlink()
-        await night.seconds(5)
-        assert night.recorder.saved.frames == full.frames + 5
+        await recorded.seconds(5)
+        assert recorded.recorder.saved.frames == full.frames + 5
     session = Session.open(disk / "s")
     assert [path.name for path in session.incomplete] == [f"{full.frames // 8:04d}.mcap.part"]
-    assert len(session.events()) == len(night.events)
-    assert night.reported("note") == [f"second {k}" for k in range(85)]
-    assert list(lost_blocks(night)) == list(range(full.frames, 80))
-    assert all("No space left" in text for text in night.reported("frames_dropped"))
-    assert night.reported("telemetry_not_saved") == []
-    assert night.recorder.frames_lost == 80 - full.frames
+    assert len(session.events()) == len(recorded.events)
+    assert recorded.reported("note") == [f"second {k}" for k in range(85)]
+    assert list(lost_blocks(recorded)) == list(range(full.frames, 80))
+    assert all("No space left" in text for text in recorded.reported("frames_dropped"))
+    assert recorded.reported("telemetry_not_saved") == []
+    assert recorded.recorder.frames_lost == 80 - full.frames
     kept = [got.block_id for got in session.frames()]
     assert set(kept) | set(readable_blocks(disk / "s")) == set(range(16, full.frames)) | set(range(80, 85))
 
@@ -118,20 +118,24 @@ async def test_frames_leave_the_end_of_the_disk_to_the_telemetry_and_come_back(d
     settings = RecordingSettings(
         "raw", segment_bytes=8_000_000, stop_frames_below_bytes=30_000_000, alert_below_fraction=0.6
     )
-    async with Night(disk / "s", settings) as night:
-        await night.seconds(30)
-        assert 18 <= night.recorder.saved.frames <= 22  # 67 MB, 16 the telemetry's, 30 left, looked at once a second
+    async with RecordedRun(disk / "s", settings) as recorded:
+        await recorded.seconds(30)
+        assert 18 <= recorded.recorder.saved.frames <= 22  # 67 MB, 16 the telemetry's, 30 left, looked at once a second
         assert not list((disk / "s" / "frames").glob("*.part"))  # nothing is open, and nothing reserved
         (disk / "ballast").write_bytes(bytes(9_000_000))
-        await night.seconds(10)
+        await recorded.seconds(10)
         for path in [*sorted((disk / "s" / "frames").glob("*.mcap"))[:2], disk / "ballast"]:
             path.unlink()
-        await night.seconds(5)
-    assert [len(night.reported(kind)) for kind in ("disk_nearly_full", "frames_stopped", "frames_resumed")] == [1, 1, 1]
-    lost = list(lost_blocks(night))
-    assert len(lost) == night.recorder.frames_lost == 45 - night.recorder.saved.frames
+        await recorded.seconds(5)
+    assert [len(recorded.reported(kind)) for kind in ("disk_nearly_full", "frames_stopped", "frames_resumed")] == [
+        1,
+        1,
+        1,
+    ]
+    lost = list(lost_blocks(recorded))
+    assert len(lost) == recorded.recorder.frames_lost == 45 - recorded.recorder.saved.frames
     assert lost == list(range(lost[0], lost[-1] + 1))
-    assert all("0.0 GB free" in text for text in night.reported("frames_dropped"))
+    assert all("0.0 GB free" in text for text in recorded.reported("frames_dropped"))
     assert [got.block_id for got in Session.open(disk / "s").frames()][-5:] == [40, 41, 42, 43, 44]
     assert not Session.open(disk / "s").incomplete
 
@@ -139,7 +143,7 @@ async def test_frames_leave_the_end_of_the_disk_to_the_telemetry_and_come_back(d
 async def test_frames_take_no_more_than_is_left_above_the_threshold(disk):
     """A segment that may have 1 GB begins on a disk of 64 MB."""
     settings = RecordingSettings("raw", stop_frames_below_bytes=20_000_000, alert_below_fraction=0.0)
-    async with Night(disk / "s", settings) as night:
-        await night.seconds(3)
-        assert night.recorder.saved.frames == 3
-    assert night.reported("frames_dropped") == []
+    async with RecordedRun(disk / "s", settings) as recorded:
+        await recorded.seconds(3)
+        assert recorded.recorder.saved.frames == 3
+    assert recorded.reported("frames_dropped") == []

@@ -40,7 +40,7 @@ from thermostand.recording.writing.session_spec import list_telemetry_topics
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
 START_NS = 1_767_290_400 * NS_PER_S
-METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
+METADATA = {"format": str(FORMAT), "session_id": "cycle-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n"}
 ENCODER = TelemetryEncoder(declare_devices({"camera": "camera"}))
 SEGMENTS = (f"{TELEMETRY}/0000.mcap", f"{FRAMES}/0000.mcap")
@@ -51,7 +51,7 @@ ROUNDS = 8
 INPUTS = 10_000
 SALVAGES = 1000
 VERIFICATIONS = 1000
-# Seed, and what part of a round of the night is tried.
+# Seed, and what part of a round of the session is tried.
 PARTS = [(0, 10), *(pytest.param(seed, 1, marks=pytest.mark.nightly) for seed in range(ROUNDS // 4))]
 
 

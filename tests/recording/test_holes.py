@@ -1,4 +1,4 @@
-"""What is missing of a session is said, by everything that reads it; a copy of it lacks the same."""
+"""What is missing of a session is reported, by everything that reads it; a copy of it lacks the same."""
 
 import asyncio
 import re
@@ -32,14 +32,14 @@ from .runs import SECONDS, ended, entries, publish_half_done, publish_killed, re
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A complete run in five or six segments of each series; not to be changed."""
-    directory = tmp_path_factory.mktemp("sessions") / "night-1"
+    directory = tmp_path_factory.mktemp("sessions") / "cycle-1"
     asyncio.run(record_run(directory))
     return directory
 
 
 @pytest.fixture
 def session(whole, tmp_path):
-    return shutil.copytree(whole, tmp_path / "night-1")
+    return shutil.copytree(whole, tmp_path / "cycle-1")
 
 
 def last_numbers(directory, series, count):
@@ -65,9 +65,9 @@ def errors(directory):
 
 def refused(directory):
     """The sentence with which a session is refused that is not whole."""
-    said = []
-    open_whole(directory, said.append)
-    (text,) = said
+    warnings = []
+    open_whole(directory, warnings.append)
+    (text,) = warnings
     sentence = text.removesuffix("; only the rest is used")
     with pytest.raises(SessionError) as raised:
         open_whole(directory)
@@ -206,7 +206,7 @@ def test_doubled_and_swapped_segments_are_refused_and_damaged(session, series):
 
 
 async def test_frames_of_another_session_are_refused_by_everything_that_uses_them(session, tmp_path):
-    other = (await record_run(tmp_path / "night-2")) / FRAMES / "0001.mcap"
+    other = (await record_run(tmp_path / "cycle-2")) / FRAMES / "0001.mcap"
     (session / FRAMES / "0001.mcap").write_bytes(other.read_bytes().replace(b"DA1234567", b"DA7654321"))
     with pytest.raises(SessionError, match=r"frames/0001\.mcap: "):
         export(Session.open(session), tmp_path / "out", report=lambda done, text: None)
@@ -252,7 +252,7 @@ def test_a_part_lacks_what_the_session_lacked_in_its_range_and_no_more(session, 
     trim(original, tmp_path / "sound", START_NS + 14 * NS_PER_S, START_NS + 17 * NS_PER_S)
     assert words(tmp_path / "sound") == (RunOutcome.COMPLETE, Files.SOUND)
     (note,) = map(str, verify(tmp_path / "sound").findings[:1])
-    assert "night-1: 2026-01-01 18:00:14 to 2026-01-01 18:00:17 UTC" in note
+    assert "cycle-1: 2026-01-01 18:00:14 to 2026-01-01 18:00:17 UTC" in note
 
 
 async def test_a_part_is_sound_however_its_run_ended_and_so_is_a_part_of_it(tmp_path):
@@ -285,7 +285,7 @@ async def test_what_a_kill_cost_is_no_hole_and_its_copies_are_sound(tmp_path):
     assert words(part) == (RunOutcome.INTERRUPTED, Files.SOUND)
 
 
-async def test_frames_the_recorder_said_it_lost_are_no_hole(tmp_path):
+async def test_frames_that_the_recorder_reported_as_lost_are_no_hole(tmp_path):
     directory = tmp_path / "s"
     await record(directory, 4)
     assert open_whole(directory).holes == ()
@@ -305,7 +305,7 @@ def test_a_session_of_an_earlier_format_is_refused_with_a_sentence(session, form
     assert verify(session).files is scan(session).files is Files.UNKNOWN
 
 
-def test_of_a_later_format_it_is_unknown_whether_everything_is_there(session):
+def test_of_a_later_format_it_is_unknown_whether_it_is_complete(session):
     everywhere(session, format="4")
     found, seen = verify(session), scan(session)
     assert found.files is seen.files is Files.UNKNOWN

@@ -43,7 +43,7 @@ def _not_for_ever() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run of the installed stand."""
-    folder = tmp_path_factory.mktemp("recorded") / "night"
+    folder = tmp_path_factory.mktemp("recorded") / "cycle"
     config_text = find_packaged("", "simulated").read_text("utf-8")
     asyncio.run(record(folder, SECONDS, second, segment_s=60.0, attachments={"config.yaml": config_text}))
     write_journal(folder, *entries())
@@ -86,7 +86,7 @@ def test_every_command_answers_on_what_is_no_file(session: Path, hostile: str, t
         assert "Traceback" not in result.output
 
 
-def test_a_run_is_not_held_up_by_what_somebody_left_beside_its_sessions(session: Path):
+def test_a_run_is_not_held_up_by_other_files_among_its_sessions(session: Path):
     """What `stand run` does before it begins, on pipes under the names of unfinished segments."""
     for name in ("0007.mcap.part", "0008.mcap.tmp"):
         os.mkfifo(session / "telemetry" / name)

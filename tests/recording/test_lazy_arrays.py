@@ -107,7 +107,7 @@ async def test_cameras_are_apart_and_sizes_are_not_mixed(tmp_path: Path):
     assert "7 x 4 px" in str(caught.value)
 
 
-async def test_damage_is_said_when_it_is_computed(tmp_path: Path):
+async def test_damage_is_reported_when_it_is_computed(tmp_path: Path):
     await record(tmp_path / "s", 4, items)
     session = Session.open(tmp_path / "s")
     frames = session.to_xarray()["camera"]

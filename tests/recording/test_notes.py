@@ -26,18 +26,18 @@ def test_notes_and_tags_are_kept_in_order(tmp_path: Path):
     add_tags(tmp_path, ["paper", "lens-B"], "eva", 6)
     add_tags(tmp_path, ["paper", "2026"], "jan", 7)
     add_tags(tmp_path, ["lens-B"], "jan", 8, remove=True)
-    add_archived(tmp_path, Archived("/nas/night", 9, "0f"), "jan")
+    add_archived(tmp_path, Archived("/nas/cycle", 9, "0f"), "jan")
     assert read_notes(tmp_path) == SessionNotes(
-        (Note(5, "eva", "door opened\n at 19:10"),), ("paper", "2026"), (Archived("/nas/night", 9, "0f"),)
+        (Note(5, "eva", "door opened\n at 19:10"),), ("paper", "2026"), (Archived("/nas/cycle", 9, "0f"),)
     )
 
 
-def test_without_a_file_nothing_was_said(tmp_path: Path):
+def test_without_a_file_no_note_was_made(tmp_path: Path):
     assert read_notes(tmp_path) == SessionNotes()
     assert read_notes(tmp_path / "nowhere") == SessionNotes()
 
 
-def test_a_torn_or_damaged_line_costs_only_itself(tmp_path: Path):
+def test_a_partial_or_damaged_line_costs_only_itself(tmp_path: Path):
     path = tmp_path / NOTES_NAME
     add_note(tmp_path, "first", "eva", 1)
     with path.open("ab") as file:
@@ -104,9 +104,9 @@ sys.exit(3)
 def test_a_folder_that_is_a_link_gets_no_note(tmp_path: Path):
     other = tmp_path / "elsewhere"
     other.mkdir()
-    (tmp_path / "night").symlink_to(other)
+    (tmp_path / "cycle").symlink_to(other)
     with pytest.raises(SessionError, match="symbolic link"):
-        add_note(tmp_path / "night", "x", "eva", 1)
+        add_note(tmp_path / "cycle", "x", "eva", 1)
     assert list(other.iterdir()) == []
 
 
@@ -116,7 +116,7 @@ def test_notes_given_at_once_are_all_kept(tmp_path: Path):
     assert sorted(note.time_ns for note in read_notes(tmp_path).notes) == list(range(40))
 
 
-def test_what_is_damaged_of_the_notes_is_named_and_nothing_is_written_behind_what_is_torn(tmp_path: Path):
+def test_damage_of_the_notes_is_named_and_nothing_is_written_behind_a_partial_line(tmp_path: Path):
     for number in range(3):
         add_note(tmp_path, f"note {number}", "eva", number)
     path = tmp_path / NOTES_NAME
@@ -126,9 +126,9 @@ def test_what_is_damaged_of_the_notes_is_named_and_nothing_is_written_behind_wha
     assert read_notes(tmp_path).damage.startswith("line 1 and 1 more of 3 are damaged")
     assert [note.text for note in read_notes(tmp_path).notes] == ["note 1"]
     path.write_bytes(whole[:-4])
-    said = read_notes(tmp_path)
-    assert (len(said.notes), said.damage) == (2, "")
-    assert f"the last {len(third) - 4} bytes are no line" in said.unended
+    by_operator = read_notes(tmp_path)
+    assert (len(by_operator.notes), by_operator.damage) == (2, "")
+    assert f"the last {len(third) - 4} bytes are no line" in by_operator.unended
     add_note(tmp_path, "note 2", "eva", 2)
     assert path.read_bytes() == whole
     other = tmp_path / "renamed"

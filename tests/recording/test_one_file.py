@@ -19,8 +19,8 @@ async def exported(tmp_path, encoding: FrameEncoding = "zstd", **choices):
     await record(tmp_path / "s", encoding=encoding)
     add_note(tmp_path / "s", "windy", "eva", 1)
     session = Session.open(tmp_path / "s")
-    export_mcap(session, tmp_path / "night.mcap", report=silent, **choices)
-    return session, tmp_path / "night.mcap"
+    export_mcap(session, tmp_path / "cycle.mcap", report=silent, **choices)
+    return session, tmp_path / "cycle.mcap"
 
 
 def found(path):
@@ -50,7 +50,7 @@ def keys(messages):
 
 
 @pytest.mark.parametrize("encoding", ["zstd", "raw"])
-async def test_every_message_is_there_once_in_order_of_time(tmp_path, encoding):
+async def test_every_message_is_given_once_in_order_of_time(tmp_path, encoding):
     session, path = await exported(tmp_path, encoding)
     messages, summary, attachments, metadata = found(path)
     assert [each for each in messages if each[0] not in FRAMES] == keys(telemetry(session))
@@ -87,7 +87,7 @@ async def test_of_a_damaged_session_nothing_appears(tmp_path):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["s"]
 
 
-async def test_what_is_there_is_not_overwritten(tmp_path):
+async def test_existing_files_are_not_overwritten(tmp_path):
     session, path = await exported(tmp_path)
     with pytest.raises(SessionError, match="is in the way"):
         export_mcap(session, path, report=silent)

@@ -121,9 +121,9 @@ async def test_a_session_without_telemetry_is_not_complete(session):
     for path in (session / "telemetry").iterdir():
         path.rename(path.with_name(f"{path.name}.damaged"))
     kept = len(list((session / "telemetry").iterdir()))
-    said = scan(session).state_text
-    assert said.startswith("damaged: telemetry/0000.mcap.damaged: ")
-    assert said.endswith(f" and {kept - 1} more")
+    sentence = scan(session).state_text
+    assert sentence.startswith("damaged: telemetry/0000.mcap.damaged: ")
+    assert sentence.endswith(f" and {kept - 1} more")
     shutil.rmtree(session / "telemetry")
     assert scan(session).state_text == "incomplete: telemetry: is missing"
     assert summarise_session(session).frames.count == 5
@@ -143,7 +143,7 @@ async def test_frames_that_the_recorder_lost_are_counted_apart_from_those_that_n
 
 async def test_what_a_salvage_kept_and_what_is_no_segment(session):
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0000.2.mcap.damaged")
-    (session / "frames" / "notes.txt").write_text("a cloudy night")
+    (session / "frames" / "notes.txt").write_text("a cloudy day")
     seen = scan(session)
     assert seen.state_text.startswith("damaged: frames/0000.2.mcap.damaged: ")
     assert [finding.where for finding in seen.findings] == ["frames/0000.2.mcap.damaged"]

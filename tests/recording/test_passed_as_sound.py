@@ -28,7 +28,7 @@ from thermostand.recording.repair.salvage import salvage_session
 
 @pytest.fixture
 async def session(tmp_path):
-    return await record_run(tmp_path / "night-1")
+    return await record_run(tmp_path / "cycle-1")
 
 
 def words(directory):
@@ -116,14 +116,14 @@ def test_what_a_session_is_alone_goes_with_its_copies():
 
 
 @pytest.fixture(scope="module")
-def ended_nights(tmp_path_factory):
+def ended_sessions(tmp_path_factory):
     """Two complete runs of one second and recipe, whose manifests have their journals; not to be changed."""
-    nights = tmp_path_factory.mktemp("nights")
-    for name, uid in (("night-1", "00ff"), ("night-2", "11ee")):
-        directory = asyncio.run(record_run(nights / name))
+    folder = tmp_path_factory.mktemp("cycles")
+    for name, uid in (("cycle-1", "00ff"), ("cycle-2", "11ee")):
+        directory = asyncio.run(record_run(folder / name))
         everywhere(directory, uid=uid)
         end(directory)
-    return nights
+    return folder
 
 
 def end(directory, **changes):
@@ -135,9 +135,9 @@ def end(directory, **changes):
 
 
 @pytest.fixture
-def night(ended_nights, tmp_path):
-    """The first of them; `night.parent / "night-2"` is the other."""
-    return Path(shutil.copytree(ended_nights, tmp_path / "nights")) / "night-1"
+def recorded(ended_sessions, tmp_path):
+    """The first of them; `session.parent / "session-2"` is the other."""
+    return Path(shutil.copytree(ended_sessions, tmp_path / "cycles")) / "cycle-1"
 
 
 def journal_lines_of(directory):
@@ -150,7 +150,7 @@ def rewrite_journal(directory, lines):
 
 def swap_with(directory, name):
     """The segments of that name of both sessions, exchanged."""
-    one, other = directory / name, directory.parent / "night-2" / name
+    one, other = directory / name, directory.parent / "cycle-2" / name
     mine = one.read_bytes()
     one.write_bytes(other.read_bytes())
     other.write_bytes(mine)
@@ -181,8 +181,8 @@ def empty_segment(directory):
     (directory / TELEMETRY / "0006.mcap").write_bytes(b"")
 
 
-# What was done, the word it makes, the file that it is said of, and whether a list, which reads both ends of each file,
-# says the same.
+# What was done, the word it makes, the file that it is reported of, and whether a list, which reads both ends of each
+# file, says the same.
 CASES = {
     "the last segment of the frames removed": (
         lambda s: remove(s, FRAMES, 4), Files.INCOMPLETE, "frames/0004.mcap", True
@@ -228,7 +228,7 @@ CASES = {
     "the manifest removed": (lambda s: (s / MANIFEST_NAME).unlink(), Files.INCOMPLETE, MANIFEST_NAME, True),
     "the manifest empty": (lambda s: (s / MANIFEST_NAME).write_bytes(b""), Files.DAMAGED, MANIFEST_NAME, True),
     "the manifest of another session": (
-        lambda s: shutil.copy(s.parent / "night-2" / MANIFEST_NAME, s), Files.DAMAGED, MANIFEST_NAME, True
+        lambda s: shutil.copy(s.parent / "cycle-2" / MANIFEST_NAME, s), Files.DAMAGED, MANIFEST_NAME, True
     ),
     "the manifest edited": (
         lambda s: edit_manifest(s, '"frames": 20', '"frames": 19'), Files.DAMAGED, MANIFEST_NAME, True
@@ -272,42 +272,42 @@ def flip_library(path):
 
 
 @pytest.mark.parametrize(("change", "files", "where", "is_listed"), CASES.values(), ids=CASES)
-def test_each_case_has_its_word_and_its_sentence_in_all_that_reads(night, change, files, where, is_listed):
-    assert words(night) is Files.SOUND
-    change(night)
-    found = verify(night)
+def test_each_case_has_its_word_and_its_sentence_in_all_that_reads(recorded, change, files, where, is_listed):
+    assert words(recorded) is Files.SOUND
+    change(recorded)
+    found = verify(recorded)
     assert (found.files, found.is_sound) == (files, False)
     assert where in [finding.where for finding in found.findings if finding.files is files]
     if is_listed:
-        listed = scan(night)
+        listed = scan(recorded)
         assert listed.files is files
-        assert summarise_session(night).scanned.files is files
+        assert summarise_session(recorded).scanned.files is files
         assert where in [finding.where for finding in listed.findings if finding.files is files]
     if where != JOURNAL_NAME and is_listed:  # no export and no fit reads the journal
         with pytest.raises(SessionError):
-            open_whole(night)
+            open_whole(recorded)
 
 
 @pytest.mark.parametrize("case", ["the manifest removed", "the manifest empty", "the manifest of another session"])
-def test_a_salvage_makes_a_manifest_of_what_is_there_and_it_says_so(night, case):
-    CASES[case][0](night)
-    salvage_session(night)
-    found = verify(night)
+def test_a_repair_makes_a_manifest_of_what_is_left_and_it_says_so(recorded, case):
+    CASES[case][0](recorded)
+    salvage_session(recorded)
+    found = verify(recorded)
     if case == "the manifest of another session":  # it may be the segments that are another's
         assert found.files is Files.DAMAGED
         return
     assert found.files is Files.SOUND
     assert named(found) == [MANIFEST_NAME]
-    assert open_whole(night).frame_count == SECONDS
+    assert open_whole(recorded).frame_count == SECONDS
 
 
-def test_a_segment_that_its_recorder_did_not_come_to_list_is_a_note_until_it_is_listed(night):
-    remake_manifest(night, segments=without(read_manifest(night), "frames/0004.mcap"), ended=False, journal=None)
-    found = verify(night)
-    assert found.files is scan(night).files is Files.SOUND
+def test_a_segment_that_its_recorder_did_not_come_to_list_is_a_note_until_it_is_listed(recorded):
+    remake_manifest(recorded, segments=without(read_manifest(recorded), "frames/0004.mcap"), ended=False, journal=None)
+    found = verify(recorded)
+    assert found.files is scan(recorded).files is Files.SOUND
     assert named(found) == ["frames/0004.mcap"]
-    assert salvage_session(night) == []
-    assert named(verify(night)) == []
+    assert salvage_session(recorded) == []
+    assert named(verify(recorded)) == []
 
 
 @pytest.mark.parametrize("depth", Depth)
@@ -340,6 +340,6 @@ def without_regulator(time_ns, index):
 
 
 def test_the_same_seed_gives_the_same_manifest(tmp_path):
-    made = [asyncio.run(record_run(tmp_path / name / "night-1")) / MANIFEST_NAME for name in "ab"]
+    made = [asyncio.run(record_run(tmp_path / name / "cycle-1")) / MANIFEST_NAME for name in "ab"]
     assert made[0].read_bytes() == made[1].read_bytes()
     assert json.loads(made[0].read_bytes())["plan"] == {"steps": SECONDS, "frames": SECONDS}

@@ -34,7 +34,7 @@ from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.session_spec import list_telemetry_topics, make_frames_topic
 from thermostand.recording.writing.telemetry import TelemetryEncoder
 
-METADATA = {"format": str(FORMAT), "session_id": "night-1"}
+METADATA = {"format": str(FORMAT), "session_id": "cycle-1"}
 
 
 def at(second):
@@ -332,7 +332,7 @@ def chunks(records):
     return [record for record in records if record.opcode == Opcode.CHUNK]
 
 
-def value_beside_a_bad_quality(records):
+def value_with_a_bad_quality(records):
     message = chunks(records)[0].inner[-1]
     good = form("thermometers").message.FromString(message.content[22:])
     good.air_degC_quality = 3
@@ -361,7 +361,7 @@ def attachment_without_end(records):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (value_beside_a_bad_quality, r"thermometers\.air: the recorded value 20\.0 does not fit its quality 3"),
+        (value_with_a_bad_quality, r"thermometers\.air: the recorded value 20\.0 does not fit its quality 3"),
         (unknown_quality, "does not fit its quality 9"),
         (message_removed, r"0000\.mcap: damaged .*it does not hold the messages that its index lists"),
         (attachment_without_end, r"0000\.mcap: damaged .*OverflowError"),
@@ -399,7 +399,7 @@ def test_metadata_that_changed_is_seen_even_in_a_session_of_one_segment(tmp_path
     write_items(tmp_path, [batch(0)])
     path = tmp_path / TELEMETRY / "0000.mcap"
     data = path.read_bytes()
-    path.write_bytes(data.replace(b"night-1", b"night-7"))
+    path.write_bytes(data.replace(b"cycle-1", b"cycle-7"))
     with pytest.raises(SessionError, match=r"metadata .* CRC"):
         Session.open(tmp_path)
 

@@ -31,9 +31,9 @@ SERIES = [TELEMETRY, FRAMES]
 @pytest.mark.parametrize("trials", TRIALS)
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
-def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, series, damage, trials):
+def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, intact, series, damage, trials):
     rng = random.Random(f"{series} {damage.__name__}")
-    for offset in rng.sample(range(len(night[1][series, "part"].data)), trials):
+    for offset in rng.sample(range(len(intact[1][series, "part"].data)), trials):
         folder, path, written = damaged(series, lambda data, at=offset: damage(data, at, rng))
         data = path.read_bytes()
         (done,) = salvage_session(folder.parent)
@@ -48,10 +48,10 @@ def test_what_is_not_damaged_is_delivered_and_nothing_else(damaged, night, serie
 @pytest.mark.parametrize("trials", TRIALS)
 @pytest.mark.parametrize("sector_bytes", [512, 4096])
 @pytest.mark.parametrize("earlier", [False, True])
-def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, night, earlier, sector_bytes, trials):
+def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, intact, earlier, sector_bytes, trials):
     """It holds whole chunks with right CRCs: of this segment, or of a minute before."""
-    rng, part = random.Random(f"{earlier} {sector_bytes}"), night[1][TELEMETRY, "part"].data
-    source = night[1][TELEMETRY, "finished"].data if earlier else part
+    rng, part = random.Random(f"{earlier} {sector_bytes}"), intact[1][TELEMETRY, "part"].data
+    source = intact[1][TELEMETRY, "finished"].data if earlier else part
     for _ in range(trials):
         begin, to = (rng.randrange(sector_bytes, len(part) - sector_bytes, sector_bytes) for _ in range(2))
         begin = min(begin, to) if earlier else begin
@@ -67,9 +67,9 @@ def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, night, earlier, s
 @pytest.mark.parametrize("trials", [8, mark_nightly(300)])
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
-def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, night, series, damage, trials):
+def test_a_finished_segment_that_is_damaged_is_salvaged_and_kept(damaged, intact, series, damage, trials):
     rng = random.Random(f"finished {series} {damage.__name__}")
-    for offset in rng.sample(range(len(night[1][series, "finished"].data)), trials):
+    for offset in rng.sample(range(len(intact[1][series, "finished"].data)), trials):
         folder, path, written = damaged(series, lambda data, at=offset: damage(data, at, rng), "finished")
         data = path.read_bytes()
         done = {result.source: result for result in salvage_session(folder.parent)}
@@ -121,12 +121,12 @@ def test_a_block_that_was_being_written_is_no_loss(damaged, series):
         assert names(folder) == ["0000.mcap", "0001.mcap"]
 
 
-def test_what_was_wrong_and_what_became_of_it_is_said(damaged):
+def test_what_was_wrong_and_what_became_of_it_is_reported(damaged):
     folder, _, _ = damaged(FRAMES, hole(9000, 9100))
     (done,) = salvage_session(folder.parent)
     assert re.match(rf"1 damaged place of {done.lost_bytes} bytes, .* byte \d+$", done.reason)
-    said = format_salvaged(done)
-    assert f"{done.messages} messages in 0001.mcap, {done.lost_bytes} bytes lost" in said
+    text = format_salvaged(done)
+    assert f"{done.messages} messages in 0001.mcap, {done.lost_bytes} bytes lost" in text
     folder, _, _ = damaged(FRAMES, lambda data: hole(9000, 9100)(hole(30_000, 30_100)(data)))
     (done,) = salvage_session(folder.parent)
     assert done.reason.startswith(f"2 damaged places of {done.lost_bytes} bytes")
@@ -146,8 +146,8 @@ def test_a_second_damaged_original_of_a_number_gets_a_name_of_its_own(damaged):
 
 
 @pytest.mark.parametrize("series", SERIES)
-def test_a_lost_opening_is_taken_from_the_siblings(damaged, night, series):
-    lost = night[1][series, "part"].blocks[0].end
+def test_a_lost_opening_is_taken_from_the_siblings(damaged, intact, series):
+    lost = intact[1][series, "part"].blocks[0].end
     folder, path, written = damaged(series, hole(0, lost))
     data = path.read_bytes()
     (done,) = salvage_session(folder.parent)
@@ -185,7 +185,7 @@ def test_the_other_series_tells_the_session(tmp_path):
 @pytest.mark.parametrize(
     "siblings",
     [
-        [{"metadata": METADATA | {"session_id": "night-2"}}],
+        [{"metadata": METADATA | {"session_id": "cycle-2"}}],
         [{"attachments": ATTACHMENTS | {"recipe.yaml": "name: other\n"}}],
         [{}, {"topics": TOPICS[TELEMETRY][::-1]}],
     ],
@@ -215,7 +215,7 @@ def test_metadata_is_voted_on(damaged):
 @pytest.mark.parametrize("record", ["session", "segment"])
 def test_a_flipped_letter_in_the_metadata_of_a_finished_segment_is_repaired(damaged, series, record):
     crc = make_segment_metadata(series, 0, METADATA)["session_crc32"].encode()
-    damage = {"session": (b"night-1", b"night-3"), "segment": (crc, crc[:-1] + b"g")}[record]
+    damage = {"session": (b"cycle-1", b"cycle-3"), "segment": (crc, crc[:-1] + b"g")}[record]
     folder, path, written = damaged(series, lambda data: data.replace(*damage, 1), "finished")
     salvaged = {done.source: done for done in salvage_session(folder.parent)}
     done = salvaged[path]
@@ -225,7 +225,7 @@ def test_a_flipped_letter_in_the_metadata_of_a_finished_segment_is_repaired(dama
     assert read_segment(path) == written.messages
     assert Session.open(folder.parent).metadata == METADATA
     errors = [finding.where for finding in verify(folder.parent).findings if finding.severity is Severity.ERROR]
-    assert not any(errors)  # "": the night lacks frames
+    assert not any(errors)  # "": the session lacks frames
 
 
 def test_metadata_with_the_zeros_of_a_lost_block_is_no_metadata(tmp_path):

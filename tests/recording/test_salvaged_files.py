@@ -34,8 +34,8 @@ def test_a_part_that_never_held_anything_is_removed(damaged, content):
     assert names(folder) == ["0000.mcap"]
 
 
-def test_an_opening_without_a_message_is_removed(damaged, night):
-    folder, _, _ = damaged(FRAMES, lambda data: data[: night[1][FRAMES, "part"].opening_bytes])
+def test_an_opening_without_a_message_is_removed(damaged, intact):
+    folder, _, _ = damaged(FRAMES, lambda data: data[: intact[1][FRAMES, "part"].opening_bytes])
     (done,) = salvage_session(folder.parent)
     assert (done.path, done.kept) == (None, None)
     assert names(folder) == ["0000.mcap"]
@@ -56,7 +56,7 @@ def test_bytes_that_are_no_recording_are_kept(damaged):
     assert done.kept.read_bytes() == b"notes of the night\n" * 50
 
 
-def test_beside_its_finished_segment_a_part_that_holds_nothing_more_is_removed(damaged):
+def test_a_part_that_holds_no_more_than_its_finished_segment_is_removed(damaged):
     folder, path, written = damaged(TELEMETRY, lambda data: data)
     (done,) = salvage_session(folder.parent)
     for cut in (len(written.data), written.blocks[30].end):
@@ -67,8 +67,8 @@ def test_beside_its_finished_segment_a_part_that_holds_nothing_more_is_removed(d
         assert read_segment(done.path) == written.messages
 
 
-def test_beside_a_finished_segment_a_part_that_holds_more_replaces_it(damaged, night):
-    cut = night[1][TELEMETRY, "part"].blocks[30].end
+def test_a_part_that_holds_more_replaces_its_finished_segment(damaged, intact):
+    cut = intact[1][TELEMETRY, "part"].blocks[30].end
     folder, path, written = damaged(TELEMETRY, lambda data: data[:cut])
     salvage_session(folder.parent)
     path.write_bytes(written.data)
@@ -79,7 +79,7 @@ def test_beside_a_finished_segment_a_part_that_holds_more_replaces_it(damaged, n
 
 
 @pytest.mark.parametrize("spoil", [lambda data: data[: len(data) // 3], lambda data: b""])
-def test_beside_a_damaged_finished_segment_the_part_wins(damaged, spoil):
+def test_a_part_wins_over_a_damaged_finished_segment(damaged, spoil):
     folder, path, written = damaged(TELEMETRY, lambda data: data)
     (done,) = salvage_session(folder.parent)
     spoiled = spoil(done.path.read_bytes())
@@ -91,17 +91,17 @@ def test_beside_a_damaged_finished_segment_the_part_wins(damaged, spoil):
     assert (folder / "0001.mcap.damaged").read_bytes() == spoiled
 
 
-def test_beside_a_finished_segment_with_other_messages_the_part_is_kept(damaged, night):
+def test_a_part_with_other_messages_than_its_finished_segment_is_kept(damaged, intact):
     folder, path, written = damaged(TELEMETRY, lambda data: data)
     path.replace(folder / "0000.mcap.part")
     (done,) = salvage_session(folder.parent)
     assert (done.source, done.path, done.messages) == (folder / "0000.mcap.part", folder / "0000.mcap", 0)
     assert done.kept.read_bytes() == written.data
-    assert read_segment(done.path) == night[1][TELEMETRY, "finished"].messages
+    assert read_segment(done.path) == intact[1][TELEMETRY, "finished"].messages
 
 
 def test_of_a_part_that_shares_some_frames_with_its_finished_segment_these_are_counted(tmp_path):
-    folder, shared = tmp_path / "night" / FRAMES, 10
+    folder, shared = tmp_path / "cycle" / FRAMES, 10
     write_segment(folder, FRAMES, range(20))
     salvage_session(folder.parent)
     write_segment(folder, FRAMES, range(20 - shared, 30))
@@ -179,7 +179,7 @@ def test_a_salvage_that_was_killed_at_any_step_is_repeated(damaged, change):
     assert salvage_session(folder.parent) == []
 
 
-TORN, DAMAGED = (lambda data: data[:-60]), hole(9000, 9500)
+PARTIAL, DAMAGED = (lambda data: data[:-60]), hole(9000, 9500)
 PLACED = ["replace", "sync_folder"]
 KEPT = ["link", "sync_folder"]
 GONE = ["unlink", "sync_folder"]
@@ -189,12 +189,12 @@ LISTED = ["fsync", *PLACED]
 @pytest.mark.parametrize(
     ("which", "change", "steps"),
     [
-        ("part", TORN, ["fsync", *PLACED, *GONE, *LISTED]),
+        ("part", PARTIAL, ["fsync", *PLACED, *GONE, *LISTED]),
         ("part", DAMAGED, ["fsync", *KEPT, *PLACED, *GONE, *LISTED]),
         ("finished", DAMAGED, ["fsync", *KEPT, *PLACED, *LISTED]),
         ("part", lambda data: b"", GONE),
     ],
-    ids=["torn", "damaged", "finished and damaged", "empty"],
+    ids=["partial", "damaged", "finished and damaged", "empty"],
 )
 def test_each_step_is_on_the_disk_before_the_next_so_that_a_power_cut_loses_nothing(damaged, which, change, steps):
     folder, _, _ = damaged(FRAMES, change, which)
@@ -229,28 +229,28 @@ def small_disk(folder, size_bytes):
         subprocess.run(["umount", folder], check=True)
 
 
-def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, night):
-    data = night[1][FRAMES, "part"].data
+def test_a_full_disk_leaves_the_original_as_it_was(tmp_path, intact):
+    data = intact[1][FRAMES, "part"].data
     with small_disk(tmp_path / "disk", len(data) + 20_000) as disk:
-        (disk / "night" / FRAMES).mkdir(parents=True)
-        part = disk / "night" / FRAMES / "0000.mcap.part"
+        (disk / "cycle" / FRAMES).mkdir(parents=True)
+        part = disk / "cycle" / FRAMES / "0000.mcap.part"
         part.write_bytes(data)
         with pytest.raises(SessionError, match=r"cannot be repaired .*No space left"):
             salvage_unfinished(disk)
-        assert names(disk) == ["night/frames/0000.mcap.part"]
+        assert names(disk) == ["cycle/frames/0000.mcap.part"]
         assert part.read_bytes() == data
 
 
-def test_what_a_dead_recorder_had_reserved_is_room_for_the_copy(tmp_path, night):
-    data = night[1][FRAMES, "part"].data
+def test_what_a_dead_recorder_had_reserved_is_space_for_the_copy(tmp_path, intact):
+    data = intact[1][FRAMES, "part"].data
     disk_bytes = 4 * len(data)
     with small_disk(tmp_path / "disk", disk_bytes) as disk:
-        (disk / "night" / FRAMES).mkdir(parents=True)
-        sink = CommitSink(disk / "night" / FRAMES / "0000.mcap.part", disk_bytes - 20_000)
+        (disk / "cycle" / FRAMES).mkdir(parents=True)
+        sink = CommitSink(disk / "cycle" / FRAMES / "0000.mcap.part", disk_bytes - 20_000)
         sink.append([data])
         sink.close()
         done, _ = salvage_unfinished(disk)
-        assert read_segment(done.path) == night[1][FRAMES, "part"].messages
+        assert read_segment(done.path) == intact[1][FRAMES, "part"].messages
 
 
 def write_with_attachment(path, attached):
@@ -269,10 +269,10 @@ def write_with_attachment(path, attached):
 
 
 @pytest.mark.parametrize("place", [None, 0, 40, 3000], ids=["whole", "head", "name", "content"])
-def test_an_attached_recording_is_not_taken_for_this_one(tmp_path, night, place):
+def test_an_attached_recording_is_not_taken_for_this_one(tmp_path, intact, place):
     (tmp_path / TELEMETRY).mkdir()
     part = tmp_path / TELEMETRY / "0000.mcap.part"
-    begin = write_with_attachment(part, night[1][TELEMETRY, "finished"].data)
+    begin = write_with_attachment(part, intact[1][TELEMETRY, "finished"].data)
     if place is not None:
         part.write_bytes(hole(begin + place, begin + place + 8)(part.read_bytes()))
     done = salvage_session(tmp_path)[0]

@@ -21,7 +21,7 @@ from thermostand.recording.writing.segment import MessageRecord, SeriesSpec, Top
 from thermostand.recording.writing.series import Series, find_next_number
 
 ATTACHMENTS = {"config.yaml": "camera:\n  gain_dB: 0.0\n"}
-SESSION = {"session_id": "night-1"}
+SESSION = {"session_id": "cycle-1"}
 RECORDS_PER_COMMIT = 8
 
 
@@ -127,7 +127,7 @@ def test_a_segment_of_a_few_chunks_is_left_as_it_is(tmp_path):
     assert len(chunks(write(tmp_path / "s", 10))) == 10
 
 
-def test_a_disk_without_room_for_the_copy_keeps_the_segment_as_it_was_committed(tmp_path):
+def test_a_disk_without_space_for_the_copy_keeps_the_segment_as_it_was_committed(tmp_path):
     with tmpfs(tmp_path / "disk", "4m") as disk:
         path = write(disk / "s", 100, 3000, reserve_bytes=3_500_000)  # 2.4 MB and an index
         assert len(chunks(path)) == 100

@@ -19,7 +19,7 @@ from thermostand.recording.writing.series import Series
 from thermostand.recording.writing.session_spec import make_readings_topic
 
 START_NS = 1_767_290_400 * NS_PER_S
-METADATA = {"format": str(FORMAT), "session_id": "night-1", "operator": "J. Krukowski"}
+METADATA = {"format": str(FORMAT), "session_id": "cycle-1", "operator": "J. Krukowski"}
 ATTACHMENTS = {"config.yaml": "a: 1\n", "target.yaml": "rows: 6\n"}
 ENCODER = declared_form("thermometers")
 TELEMETRY_TOPICS = (
@@ -157,7 +157,7 @@ def test_unfinished_segments_are_reported_and_left_alone(copy):
     assert session.readings("thermometers.air")[0].shape == (8,)
 
 
-def test_an_unknown_channel_is_answered_with_those_there_are(whole):
+def test_an_unknown_channel_is_answered_with_the_existing_ones(whole):
     with pytest.raises(SessionError, match=r"has no channel camera\.temperature; there are thermometers\.air"):
         Session.open(whole).readings("camera.temperature")
 
@@ -196,7 +196,7 @@ def foreign_mcap(directory):
 
 
 def segment_of_another_session(directory):
-    write_frames(directory, [9], {"session_id": "night-2"})
+    write_frames(directory, [9], {"session_id": "cycle-2"})
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def test_a_disk_that_cannot_reserve_is_written_to_all_the_same(tmp_path):
         assert (folder / "file").read_bytes() == b"a" * 1000
 
 
-def test_what_was_reserved_is_there_when_somebody_else_has_filled_the_disk(tmp_path):
+def test_what_was_reserved_is_left_when_another_program_has_filled_the_disk(tmp_path):
     with tmpfs(tmp_path / "disk", "8m") as folder:
         sink = CommitSink(folder / "file", 4 * MB)
         with suppress(OSError), (folder / "other").open("wb", buffering=0) as other:
@@ -146,7 +146,7 @@ def test_a_file_that_was_removed_takes_nothing_more(tmp_path):
     sink.close()
 
 
-def test_a_torn_block_that_cannot_be_cut_off_yet_is_cut_off_later(tmp_path, limited):
+def test_a_partial_block_that_cannot_be_cut_off_yet_is_cut_off_later(tmp_path, limited):
     """An append-only file cannot be made shorter, no matter who asks."""
     with ext4(tmp_path / "disk", 16 << 20) as folder:
         sink = CommitSink(folder / "file")

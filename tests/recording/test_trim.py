@@ -43,7 +43,7 @@ async def test_a_part_is_a_session_with_every_message_of_its_range(tmp_path):
     assert [got.step_id for got in part.frames()] == [f"capture-{k}" for k in range(4, 10)]
     assert event.time_ns == begin_ns
     assert event.text == (
-        "trimmed from session night-1: 2026-01-01T18:00:01.623456789Z up to 2026-01-01T18:00:04.623456789Z, "
+        "trimmed from session cycle-1: 2026-01-01T18:00:01.623456789Z up to 2026-01-01T18:00:04.623456789Z, "
         "the end not included"
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part", "s"]
@@ -115,7 +115,7 @@ async def test_images_of_several_kinds_keep_theirs(tmp_path):
         np.testing.assert_array_equal(got.image, frame(0, index // 2).image)
 
 
-async def test_an_empty_part_is_refused_with_what_there_is(tmp_path):
+async def test_an_empty_part_is_refused_with_the_span_of_the_session(tmp_path):
     await record(tmp_path / "s", 4)
     session = Session.open(tmp_path / "s")
     for begin_ns, end_ns in ((0, START_NS - 50 * MS), (START_NS + 1, START_NS + 2), (START_NS + 9, START_NS)):

@@ -366,6 +366,6 @@ def test_a_folder_without_segments_is_no_session(tmp_path):
 
 async def test_a_segment_of_another_session_is_reported(session, tmp_path):
     other = await recorded(tmp_path / "other")
-    data = (other / "frames" / "0001.mcap").read_bytes().replace(b"night-1", b"night-2")
+    data = (other / "frames" / "0001.mcap").read_bytes().replace(b"cycle-1", b"cycle-2")
     (session / "frames" / "0001.mcap").write_bytes(data)
     assert any(text.startswith("error: frames/0001.mcap: belongs to") for text in errors(session))

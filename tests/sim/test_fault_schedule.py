@@ -124,7 +124,7 @@ def test_time_without_a_plan_moves_as_before(laboratory: Laboratory):
     assert laboratory.now_ns == START_NS + S
 
 
-def test_a_plan_for_a_device_that_is_not_there_is_refused(laboratory: Laboratory):
+def test_a_plan_for_a_missing_device_is_refused(laboratory: Laboratory):
     laboratory.fakes.pop("rotary")
     for text in ("rotary.restart", "axis.alarm=rotary@2h", 'thermometer.offset_K={"roof": 1}@10'):
         with pytest.raises(ConfigError, match=r"rotary|roof"):

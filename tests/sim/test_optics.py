@@ -127,7 +127,7 @@ def test_the_glass_target_grows_with_its_own_temperature():
 
 
 @dataclass(frozen=True)
-class Night:
+class Trajectory:
     """Marker centres of a warm-up at 24 degC and of a cycle of 45-minute set-points in an ideal chamber."""
 
     warm_up: NDArray[np.float64]
@@ -138,7 +138,7 @@ class Night:
 CYCLE_degC = (*range(24, 53, 4), *range(48, 11, -4), 10, *range(12, 25, 4))
 
 
-def live_through(kind: CameraKind, roll_deg: float = 0.0, cycle_degC: tuple[int, ...] = CYCLE_degC) -> Night:
+def live_through(kind: CameraKind, roll_deg: float = 0.0, cycle_degC: tuple[int, ...] = CYCLE_degC) -> Trajectory:
     spec = PlantSpec(kind, laboratory_swing_K=0.0, camera_powered=True, camera_roll_deg=roll_deg)
     plant = Plant(spec, START_ns)
     air_degC = 24.0
@@ -158,16 +158,16 @@ def live_through(kind: CameraKind, roll_deg: float = 0.0, cycle_degC: tuple[int,
     for set_point_degC in cycle_degC:
         air_degC = float(set_point_degC)
         drift.append(seen(45) - reference)
-    return Night(warm_up, np.array(cycle_degC, dtype=float), np.array(drift))
+    return Trajectory(warm_up, np.array(cycle_degC, dtype=float), np.array(drift))
 
 
 @pytest.fixture(scope="module")
-def modified() -> Night:
+def modified() -> Trajectory:
     return live_through("modified")
 
 
 @pytest.fixture(scope="module")
-def unmodified() -> Night:
+def unmodified() -> Trajectory:
     return live_through("unmodified")
 
 
@@ -175,22 +175,22 @@ def rms(drift: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.mean(drift**2, axis=(0, 1)))
 
 
-def test_the_warm_up_drifts_by_the_papers_0_3_and_1_1_px(modified: Night):
+def test_the_warm_up_drifts_by_the_papers_0_3_and_1_1_px(modified: Trajectory):
     mean = np.abs(modified.warm_up[-1].mean(axis=0))
     assert mean == pytest.approx([0.3, 1.1], abs=0.08)
 
 
-def test_the_modified_camera_drifts_by_the_papers_0_2_and_0_6_px_rms(modified: Night):
+def test_the_modified_camera_drifts_by_the_papers_0_2_and_0_6_px_rms(modified: Trajectory):
     assert rms(modified.drift) == pytest.approx([0.2, 0.6], abs=0.05)
 
 
-def test_markers_drift_differently(modified: Night):
+def test_markers_drift_differently(modified: Trajectory):
     hottest = modified.drift[CYCLE_degC.index(52)]
     assert 0.05 < np.std(hottest[:, 0]) < 0.3
     assert 0.03 < np.std(hottest[:, 1]) < 0.3
 
 
-def test_the_modified_camera_comes_back_but_remembers_its_granite(modified: Night):
+def test_the_modified_camera_comes_back_but_remembers_its_granite(modified: Trajectory):
     ends = modified.drift[modified.set_points_degC == 24.0].mean(axis=1)
     assert np.abs(ends).max() < 0.05
     gap = np.ptp(modified.drift[modified.set_points_degC == 40.0].mean(axis=1), axis=0)
@@ -212,14 +212,14 @@ def _pin(plant: Plant, air_degC: float) -> None:
     plant.bulk_air_degC = plant.wall_degC = air_degC
 
 
-def test_the_unmodified_camera_drifts_more_and_does_not_come_back(modified: Night, unmodified: Night):
+def test_the_unmodified_camera_drifts_more_and_does_not_come_back(modified: Trajectory, unmodified: Trajectory):
     assert (rms(unmodified.drift) > 1.5 * rms(modified.drift)).all()
     ends = unmodified.drift[unmodified.set_points_degC == 24.0].mean(axis=1)
     assert (np.ptp(ends, axis=0) > (0.15, 0.3)).all()
 
 
-def test_only_the_unmodified_cameras_path_depends_on_its_orientation(modified: Night, unmodified: Night):
-    def change(kind: CameraKind, upright: Night) -> NDArray[np.float64]:
+def test_only_the_unmodified_cameras_path_depends_on_its_orientation(modified: Trajectory, unmodified: Trajectory):
+    def change(kind: CameraKind, upright: Trajectory) -> NDArray[np.float64]:
         rolled = live_through(kind, roll_deg=20.0, cycle_degC=())
         return np.abs(rolled.warm_up.mean(axis=1) - upright.warm_up.mean(axis=1)).max(axis=0)
 

@@ -48,13 +48,13 @@ class Bench:
         return x_mm / PITCH_mm, y_mm / PITCH_mm
 
 
-def night_px(bench: Bench) -> list[tuple[float, float]]:
+def record_px(bench: Bench) -> list[tuple[float, float]]:
     """Up and down again, an hour each, powered."""
     bench.air.camera_powered = True
     return [bench.wait(1.0, air_degC) for air_degC in (24.0, 34.0, 44.0, 34.0, 24.0, 14.0, 24.0)]
 
 
-def test_there_are_the_four_that_are_documented():
+def test_the_four_documented_ones_exist():
     assert PRESETS == ["dic", "nac", "navcam", "phone"]
 
 
@@ -85,21 +85,21 @@ def test_its_slowest_part_settles_with_the_time_constant_of_its_file():
     assert math.log(early_K / (34.0 - bench.camera.body_degC)) == pytest.approx(1.0, rel=0.03)
 
 
-def test_what_repeats_is_the_same_on_another_night_and_what_does_not_is_another():
+def test_what_repeats_is_the_same_in_another_session_and_what_does_not_is_another():
     cases: list[tuple[tuple[Effect, ...], bool]] = [
         (REPEATING, True),
         (("stick_slip",), False),
         (("unrepeated",), False),
     ]
     for effects, is_same in cases:
-        nights = [night_px(Bench("dic", *effects, seed=f"night {number}")) for number in (1, 2)]
-        assert (nights[0] == nights[1]) == is_same
+        sessions = [record_px(Bench("dic", *effects, seed=f"night {number}")) for number in (1, 2)]
+        assert (sessions[0] == sessions[1]) == is_same
 
 
 def test_each_effect_can_be_switched_and_leaves_the_others_as_they_are():
-    plain = night_px(Bench("nac", drawn=3))
-    alone = {name: night_px(Bench("nac", name, drawn=3)) for name in REPEATING}
-    together = night_px(Bench("nac", *REPEATING, drawn=3))
+    plain = record_px(Bench("nac", drawn=3))
+    alone = {name: record_px(Bench("nac", name, drawn=3)) for name in REPEATING}
+    together = record_px(Bench("nac", *REPEATING, drawn=3))
     for at, (x, y) in enumerate(together):
         added = [sum(each[at][axis] - plain[at][axis] for each in alone.values()) for axis in (0, 1)]
         assert (x - plain[at][0], y - plain[at][1]) == pytest.approx(added, abs=1e-9)
@@ -160,6 +160,6 @@ def test_a_far_thermometer_of_the_air_is_late_and_has_a_share_of_its_change():
 
 
 def test_drawn_cameras_differ_and_are_the_same_each_time():
-    nights = {number: night_px(Bench("navcam", drawn=number)) for number in (None, 1, 2)}
-    assert len({night[2] for night in nights.values()}) == 3
-    assert night_px(Bench("navcam", drawn=2)) == nights[2]
+    sessions = {number: record_px(Bench("navcam", drawn=number)) for number in (None, 1, 2)}
+    assert len({session[2] for session in sessions.values()}) == 3
+    assert record_px(Bench("navcam", drawn=2)) == sessions[2]

@@ -93,7 +93,7 @@ def test_a_dropped_leader_or_trailer_comes_when_asked_for(
     assert [packet.packet_id for packet in again] == list(range(last_id + 1))
 
 
-def test_a_packet_may_be_asked_for_again_as_soon_as_it_is_there(
+def test_a_packet_may_be_asked_for_again_as_soon_as_it_has_come(
     client: Client, faults: CameraFaults, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The client may be quicker than the thread that has sent it."""

@@ -179,7 +179,7 @@ def test_pymodbus_reads_and_writes_over_a_pseudo_terminal(bus: tuple[LinkFaults,
     assert (refused.isError(), refused.exception_code) == (True, 2)
 
 
-def test_pymodbus_gets_no_answer_from_a_unit_that_is_not_there(bus: tuple[LinkFaults, ModbusSerialClient]) -> None:
+def test_pymodbus_gets_no_answer_from_a_missing_unit(bus: tuple[LinkFaults, ModbusSerialClient]) -> None:
     faults, client = bus
     client.comm_params.timeout_connect = 0.1
     with pytest.raises(ModbusIOException):

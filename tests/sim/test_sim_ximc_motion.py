@@ -147,7 +147,7 @@ def test_a_speed_above_the_nominal_one_is_limited(linear: Bench) -> None:
     assert linear.status().speed == 3_200
 
 
-def test_speed_zero_never_gets_there(linear: Bench) -> None:
+def test_speed_zero_never_arrives(linear: Bench) -> None:
     linear.change("mov", "<IBHHIBB9x", f0=0)
     linear.move(100)
     assert (linear.settle().command, linear.status().steps) == (MOVE | RUNNING, 0)

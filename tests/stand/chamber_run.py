@@ -26,7 +26,7 @@ class ChamberRun:
     set_points_degC: Iterable[float]
     soak_s: float
     laboratory_degC: float = 24.0
-    disturb: Callable[["ChamberRun", float], None] = lambda night, time_s: None
+    disturb: Callable[["ChamberRun", float], None] = lambda run, time_s: None
     compressor_always: bool = False
     hub: Hub = field(default_factory=Hub)
 

@@ -81,7 +81,7 @@ class CheckedChamber(Chamber):
 
 
 def draw_good_run(seed: int) -> tuple[CheckedChamber, list[tuple[float, Action]]]:
-    """A drawn night of one to two hours in which nothing is wrong: set-points far and near, the camera switched, the
+    """A drawn session of one to two hours in which nothing is wrong: set-points far and near, the camera switched, the
     flap opened, the chamber stopped."""
     draw = random.Random(seed)
     shown = Shown(

@@ -1,4 +1,4 @@
-"""The browser and the night behind the page, and the session that commands are asked about."""
+"""The browser and the session behind the page, and the session that commands are asked about."""
 
 import asyncio
 import shutil
@@ -21,16 +21,16 @@ async def chromium():
 
 
 @pytest_asyncio.fixture(loop_scope="module")
-async def night(tmp_path: Path, chromium):
+async def desk(tmp_path: Path, chromium):
     port = free_port()
-    async with serve_cycle(tmp_path / "sessions", port) as desk:
-        desk.port, desk.chromium = port, chromium
-        yield desk
+    async with serve_cycle(tmp_path / "sessions", port) as opened:
+        opened.port, opened.chromium = port, chromium
+        yield opened
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six seconds of a night in a folder of sessions; not to be changed."""
+    """Six seconds of a session in a folder of sessions; not to be changed."""
     directory = tmp_path_factory.mktemp("sessions") / "20260101T180000Z-thermal_cycle"
     asyncio.run(record(directory, COUNT))
     return directory

@@ -52,16 +52,16 @@ def ask_repeatedly(request: bytes) -> None:
             pass
 
 
-def hold_connections(said: bytes, count: int = 40) -> None:
+def hold_connections(sent: bytes, count: int = 40) -> None:
     """Many connections that say this and no more, the oldest of which is given up for each new one."""
     clients = [connect() for _ in range(count)]
     for client in clients:
-        client.sendall(said)
+        client.sendall(sent)
     while True:
         clients.pop(0).close()
         clients.append(connect())
         with suppress(OSError):
-            clients[-1].sendall(said)
+            clients[-1].sendall(sent)
 
 
 def crowd(count: int = 200) -> None:
@@ -75,11 +75,11 @@ def crowd(count: int = 200) -> None:
         client.close()
 
 
-def drip(said: bytes) -> None:
+def drip(sent: bytes) -> None:
     """Many connections that say a little now and then."""
     clients = [connect() for _ in range(40)]
     for client in clients:
-        client.sendall(said)
+        client.sendall(sent)
     while True:
         for number, client in enumerate(clients):
             try:
@@ -87,7 +87,7 @@ def drip(said: bytes) -> None:
             except OSError:
                 client.close()
                 clients[number] = connect()
-                clients[number].sendall(said)
+                clients[number].sendall(sent)
         threading.Event().wait(0.001)
 
 

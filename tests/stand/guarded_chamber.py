@@ -1,4 +1,4 @@
-"""A night of a drawn chamber without wires: plant, regulator, thermometers and compressor, polled as by a daemon.
+"""A session of a drawn chamber without wires: plant, regulator, thermometers and compressor, polled as by a daemon.
 
 What comes out are the readings of each poll, as over the bus: the regulator's display of 0.1 K, the module's words
 and noise, the camera's steps of 0.25 K. The guard's rules look at them; when one trips, heat and cold are cut.

@@ -1,4 +1,5 @@
-"""Twelve failures of the chamber's sensors, in three phases of a night, on drawn chambers: how hot does the air get?"""
+"""Twelve failures of the chamber's sensors, in three phases of a session, on drawn chambers: how hot does the air
+get?"""
 
 from __future__ import annotations
 
@@ -128,14 +129,14 @@ class FailureRun:
         self._chamber = Chamber(chamber_seed, camera_powered=bool(config.cameras), channels=channels)
         self._table = make_watches(config, Announcements())
         self._phase, self._hot_degC = phase, hot_degC
-        before, is_there, _ = _phase(phase, hot_degC, HELD_S)
+        before, is_present, _ = _phase(phase, hot_degC, HELD_S)
         for now_ns in iterate_timed(self._chamber, before):
             assert (early := self._objection(now_ns)) is None, early
-        while not is_there(self._chamber.plant.bulk_air_degC):
+        while not is_present(self._chamber.plant.bulk_air_degC):
             assert (early := self._objection(self._chamber.poll())) is None, early
 
     def outcome(self, failure: str) -> Outcome:
-        """Once: the night is over then."""
+        """Once: the session is over then."""
         chamber = self._chamber
         FAILURES[failure](chamber)
         failed_s, chamber.hottest_degC = chamber.time_s, chamber.plant.bulk_air_degC

@@ -1,4 +1,4 @@
-"""The installed recipes as what they do to a chamber, minute by minute, and what interrupts a night."""
+"""The installed recipes as what they do to a chamber, minute by minute, and what interrupts a session."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Runs commands, each in a process of its own that is forked from one that has imported everything.
 
 `python -m tests.stand.hostile_commands` reads a list of words as JSON from each line, the program first, and answers
-with a line of JSON: exit status, seconds, greatest memory in bytes, and all that was said.
+with a line of JSON: exit status, seconds, greatest memory in bytes, and all that was printed.
 """
 
 import json
@@ -29,7 +29,7 @@ class Answer:
     status: int
     seconds: float
     memory_bytes: int
-    said: str
+    output: str
 
 
 def run_here(words: list[str]) -> None:
@@ -52,22 +52,22 @@ def run_here(words: list[str]) -> None:
 
 
 def answer(words: list[str]) -> dict[str, object]:
-    with tempfile.TemporaryFile() as output:
+    with tempfile.TemporaryFile() as pipe:
         begin_s = time.monotonic()
         child = os.fork()
         if child == 0:
             null = os.open(os.devnull, os.O_RDONLY)
-            for number, target in ((0, null), (1, output.fileno()), (2, output.fileno())):
+            for number, target in ((0, null), (1, pipe.fileno()), (2, pipe.fileno())):
                 os.dup2(null if number == 0 else target, number)
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT_BYTES, MEMORY_LIMIT_BYTES))
             signal.alarm(LIMIT_S)  # ends it
             run_here(words)
         _, status, usage = os.wait4(child, 0)
         seconds = time.monotonic() - begin_s
-        output.seek(0)
-        said = output.read().decode(errors="replace")
+        pipe.seek(0)
+        text = pipe.read().decode(errors="replace")
     code = os.waitstatus_to_exitcode(status)
-    return {"status": code, "seconds": seconds, "memory_bytes": usage.ru_maxrss * 1024, "said": said[-20_000:]}
+    return {"status": code, "seconds": seconds, "memory_bytes": usage.ru_maxrss * 1024, "output": text[-20_000:]}
 
 
 def main() -> None:

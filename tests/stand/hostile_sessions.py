@@ -302,7 +302,7 @@ ROWS: dict[str, Row] = {
     "an unfinished segment without a byte": Row(lambda s: (s / FRAMES / "0005.mcap.part").touch(), INCOMPLETE),
     "nothing but zeros": Row(lambda s: (s / FRAMES / "0005.mcap.part").write_bytes(bytes(1 << 22)), INCOMPLETE),
     "random bytes": Row(lambda s: telemetry(s, 1).write_bytes(random.Random(1).randbytes(100_000)), DAMAGED),
-    "a text for a segment": Row(lambda s: telemetry(s, 1).write_text("a cloudy night\n"), DAMAGED),
+    "a text for a segment": Row(lambda s: telemetry(s, 1).write_text("a cloudy day\n"), DAMAGED),
     "a picture for a segment": Row(lambda s: frames(s, 1).write_bytes(black(40, 30)), DAMAGED),
     # segments that are not there, or not where they belong
     "telemetry missing in the middle": Row(lambda s: telemetry(s, 2).unlink(), INCOMPLETE),
@@ -314,7 +314,7 @@ ROWS: dict[str, Row] = {
     "a segment twice": Row(double, DAMAGED),
     "two segments exchanged": Row(swap, DAMAGED),
     "the series exchanged": Row(exchange_series, DAMAGED),
-    "a segment of another session": Row(lambda s: rewrite(frames(s, 2), session_id="night-2"), DAMAGED),
+    "a segment of another session": Row(lambda s: rewrite(frames(s, 2), session_id="cycle-2"), DAMAGED),
     "a later format": Row(lambda s: everywhere(s, format="999"), UNKNOWN),
     "a format that is no number": Row(lambda s: everywhere(s, format="two"), UNKNOWN),
     "a field that is not known": Row(lambda s: everywhere(s, format_version="999"), SOUND),

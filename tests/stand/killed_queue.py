@@ -29,11 +29,11 @@ async def work(directory: Path, run_one: RunOne, clock: Now, tell: Callable[[str
 
 
 async def run(entry: QueueEntry, notes: RunNotes) -> NoReturn:
-    await notes.begun(Path(sys.argv[1]) / "night")
+    await notes.begun(Path(sys.argv[1]) / "cycle")
     for _ in range(int(sys.argv[2])):
         notes.step_done()
     await asyncio.sleep(0)
-    await notes.begun(Path(sys.argv[1]) / "night")  # written after the steps, and on the disk now
+    await notes.begun(Path(sys.argv[1]) / "cycle")  # written after the steps, and on the disk now
     os.kill(os.getpid(), signal.SIGKILL)
     raise SystemExit("it lives")
 

@@ -1,4 +1,4 @@
-"""A stand in the middle of a night, without a stand behind it: a desk whose faults, prompts and readings a test sets,
+"""A stand in the middle of a session, without a stand behind it: a desk whose faults, prompts and readings a test sets,
 a history of twelve hours, and frames of a target that drifts. Served with the page as the daemon serves it."""
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ STEPS = 3 * len(SET_POINTS)
 
 
 def set_point_degC(t_s: float) -> float:
-    """Of the night's hour."""
+    """Of the session's hour."""
     return SET_POINTS[min(max(int(t_s // SOAK_S), 0), len(SET_POINTS) - 1)]
 
 
 class CycleService(FakeService):
-    """A thermal cycle in its eleventh hour. `now_s` is the second of the night."""
+    """A thermal cycle in its eleventh hour. `now_s` is the second of the session."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -158,7 +158,7 @@ class CycleService(FakeService):
         )
 
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
-        """As a run does, whose plan is this night's."""
+        """As a run does, whose plan is this session's."""
         shown = self.plan()
         plan = [PlannedStep(each.index, each.step_id, make_step(each.kind, dict(each.parameters))) for each in shown]
         marks = [StepChanged(0, each.step_id, "started") for each in shown if each.standing != "waiting"]
@@ -237,7 +237,7 @@ class CycleService(FakeService):
         return self.began_ns + round(t_s * NS_PER_S)
 
     def batches(self, t_s: float, period_s: float) -> list[Batch]:
-        """What is polled at that second of the night: a chamber of the first order, and what follows it."""
+        """What is polled at that second of the session: a chamber of the first order, and what follows it."""
         time_ns, target = self._at(t_s), set_point_degC(t_s)
         self._air += (target - self._air) * (1 - math.exp(-period_s / 420)) + 0.02 * math.sin(t_s * 1.7)
         self._granite += (self._air - self._granite) * (1 - math.exp(-period_s / 5400))
@@ -277,7 +277,7 @@ class CycleService(FakeService):
         return 0.021 * (self._camera - 37.5) * (1 + 0.02 * math.sin(t_s))
 
     def live_through(self, viewing: PageData, period_s: float = 30.0) -> None:
-        """The night until now, into the history only."""
+        """The session until now, into the history only."""
         t_s, history = 0.0, viewing.history
         while t_s < self.now_s():
             for batch in self.batches(t_s, period_s):
@@ -340,7 +340,7 @@ def free_port() -> int:
 async def serve_cycle(
     folder: Path, port: int, *, with_frames: bool = False, prepare: Callable[[CycleService], None] = lambda _: None
 ) -> AsyncGenerator[CycleService]:
-    """The night, served at that port while inside."""
+    """The session, served at that port while inside."""
     desk = CycleService()
     desk.clock = desk.clock if isinstance(desk.clock, WallClock) else WallClock()
     prepare(desk)

@@ -132,5 +132,5 @@ NO = Refused("linear", "300 mm is outside the limits")
 async def node(desk: FakeService, folder: Path) -> AsyncGenerator[int]:
     """The port at which the desk answers SECoP while inside."""
     port = find_free_port()
-    async with serve_fake(desk, folder / "night", Interface(folder, doors=(make_secop_listener(port),))):
+    async with serve_fake(desk, folder / "cycle", Interface(folder, doors=(make_secop_listener(port),))):
         yield port

@@ -55,7 +55,7 @@ def test_it_is_in_the_table_with_its_words():
 
 async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp_path: Path):
     async with node(Flushing(), tmp_path):
-        server = find_session_server(tmp_path / "night")
+        server = find_session_server(tmp_path / "cycle")
 
         async def ask(method: str, path: str, body: dict[str, object] | None = None) -> Any:
             return await asyncio.to_thread(server.request, method, path, body)
@@ -84,20 +84,20 @@ async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp
 
 async def test_it_is_a_verb_of_the_command_line(tmp_path: Path):
     async with node(Flushing(), tmp_path):
-        typed = ["flush", "5", str(tmp_path / "night"), "--gently"]
+        typed = ["flush", "5", str(tmp_path / "cycle"), "--gently"]
         done = await asyncio.to_thread(CliRunner().invoke, make_app(Flushing), typed)
         shown = CliRunner().invoke(make_app(Flushing), ["flush", "--help"], prog_name="stand")
-    assert done.stdout == f"{tmp_path / 'night'}: flushed for 5 s, gently\n"
+    assert done.stdout == f"{tmp_path / 'cycle'}: flushed for 5 s, gently\n"
     assert "Example: stand flush 5" in shown.output
     assert "Seconds." in shown.output
 
 
 async def test_secop_has_it_and_each_order_is_recorded_with_what_came_of_it(tmp_path: Path):
-    desk, told = Flushing(), list[Event]()
+    desk, events = Flushing(), list[Event]()
 
     def follow(item: Item) -> None:
         if isinstance(item, Event) and item.kind == "command":
-            told.append(item)
+            events.append(item)
 
     desk.hub.subscribe(follow)
     async with node(desk, tmp_path) as port, talking(port) as talk:
@@ -106,11 +106,11 @@ async def test_secop_has_it_and_each_order_is_recorded_with_what_came_of_it(tmp_
         assert (await talk.asked("do run:_flush 5"))[0] == "done"
         assert (await talk.asked("do run:_flush 61"))[2][0] == "RangeError"
         assert (await talk.asked("do run:_flush 40"))[2][:2] == ["Impossible", "air for 30 s"]
-    assert [each.text.partition(": ")[2] for each in told] == [
+    assert [each.text.partition(": ")[2] for each in events] == [
         "flush for_s=5.0",
         "flush for_s=40.0: refused: air for 30 s",
     ]
-    assert [(each.data["verb"], each.data["arguments"], each.data["result"]) for each in told] == [
+    assert [(each.data["verb"], each.data["arguments"], each.data["result"]) for each in events] == [
         ("flush", {"for_s": 5.0}, "done"),
         ("flush", {"for_s": 40.0}, "refused: air for 30 s"),
     ]
@@ -121,12 +121,12 @@ async def test_the_page_has_a_button_with_its_title_and_a_field_for_each_thing_t
     desk, port = Flushing(), find_free_port()
     viewing = PageData(desk.hub, desk.clock, tmp_path, "")
 
-    def room(bridge: Bridge) -> Any:
+    def make_routes(bridge: Bridge) -> Any:
         return PageRoutes(viewing)(bridge)
 
-    interface = Interface(tmp_path, port=port, extra_routes=(room,))
+    interface = Interface(tmp_path, port=port, extra_routes=(make_routes,))
     async with (
-        serve_fake(desk, tmp_path / "night", interface),
+        serve_fake(desk, tmp_path / "cycle", interface),
         browser() as windows,
         a_page(windows, port, "plan") as page,
     ):

@@ -82,7 +82,7 @@ def test_a_recipe_knows_which_packages_it_depends_on():
         ("stairs: {}", "there is no experiment 'stairs'; did you mean staircase? There are warm_up,"),
     ],
 )
-def test_what_is_wrong_with_its_parameters_is_said_with_their_place(entry: str, sentence: str):
+def test_what_is_wrong_with_its_parameters_is_reported_with_their_place(entry: str, sentence: str):
     with pytest.raises(ConfigError) as raised:
         recipe(entry)
     assert sentence in str(raised.value)

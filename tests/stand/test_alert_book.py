@@ -1,4 +1,4 @@
-"""What is sent of a night's events: each cause once, when it has lasted, and once more when it is over."""
+"""What is sent of a session's events: each cause once, when it has lasted, and once more when it is over."""
 
 import pytest
 
@@ -59,7 +59,7 @@ def test_what_an_event_means(kind, data, cause, phase):
     assert (cause, phase) == (None, None) if sign is None else (sign.cause, sign.phase) == (cause, phase)
 
 
-def test_a_prompt_that_nobody_is_there_for_is_not_reported():
+def test_a_prompt_without_an_operator_is_not_reported():
     assert make_alert(event("prompt", level="info", attended=False)) is None
 
 

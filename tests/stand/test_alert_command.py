@@ -57,7 +57,7 @@ async def test_a_command_gets_a_trip_as_one_argument(tmp_path: Path, script: Cal
     assert text.startswith("lab: TRIPPED: ")
 
 
-async def test_what_is_not_safe_is_told_and_that_it_is_safe_again(tmp_path: Path, script: Callable[[str], str]):
+async def test_what_is_not_safe_is_reported_and_that_it_is_safe_again(tmp_path: Path, script: Callable[[str], str]):
     reported = tmp_path / "reported"
     config = AlertsConfig(command=(script(f'echo "$1" >> {reported}'),))
     hub, clock = Hub(), WallClock()

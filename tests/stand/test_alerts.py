@@ -149,7 +149,7 @@ async def test_in_virtual_time_and_without_secrets_nothing_is_sent(receiver, tmp
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_what_is_said_is_text_also_for_a_receiver_of_html(receiver, tmp_path: Path):
+def test_an_alert_is_text_also_for_a_receiver_of_html(receiver, tmp_path: Path):
     """As a mail is: a prompt, a name or a reason may be anybody's."""
     secrets = receiver.secrets(tmp_path / "s.yaml")
     secrets.write_text(secrets.read_text().replace("/TOKEN", "/TOKEN?format=html"))

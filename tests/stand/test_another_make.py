@@ -81,7 +81,7 @@ SIDES: dict[str, dict[str, object]] = {
 
 
 @pytest.fixture(scope="module")
-def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What a program in which that file is beside ours makes of a stand with each camera: a line each."""
     folder = tmp_path_factory.mktemp("stands")
     (folder / "devices").mkdir()
@@ -101,16 +101,16 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return dict(zip(SIDES, done.stdout.splitlines(), strict=True))
 
 
-def test_a_second_camera_protocol_is_one_file(said: dict[str, str]):
-    assert said["right"] == (
+def test_a_second_camera_protocol_is_one_file(answers: dict[str, str]):
+    assert answers["right"] == (
         "[('camera', 'thermostand.drivers.devices.cameras.camera_gige'), "
         "('side', 'thermostand.drivers.devices.cameras.camera_still')] 9.0"
     )
 
 
-def test_the_keys_of_a_second_camera_protocol_are_checked(said: dict[str, str]):
-    assert "packet_size: unknown key" in said["key"]
-    assert said["protocol"].endswith(" gige, still, usb3 (line 32)")
+def test_the_keys_of_a_second_camera_protocol_are_checked(answers: dict[str, str]):
+    assert "packet_size: unknown key" in answers["key"]
+    assert answers["protocol"].endswith(" gige, still, usb3 (line 32)")
 
 
 def test_a_second_regulator_make_is_a_yaml(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""When a camera without power is said to be cold, every part of the simulated one is; time is virtual."""
+"""When a camera without power is reported to be cold, every part of the simulated one is; time is virtual."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -18,7 +18,7 @@ from thermostand.stand.imaging.camera_cooling import CameraTemperature, cool_dow
 BAND_K, TIME_CONSTANT_S = WarmUp().band_K, WarmUp().time_constant_s
 
 
-class Room:
+class Cooling:
     """A simulated camera that has been on for 90 min, the air around it on the hub, and the clock of both."""
 
     def __init__(self) -> None:
@@ -59,50 +59,50 @@ class Room:
 
 
 @pytest.fixture
-async def room() -> AsyncIterator[Room]:
-    room = Room()
-    driver = asyncio.create_task(room.clock.run())
-    yield room
+async def bench() -> AsyncIterator[Cooling]:
+    bench = Cooling()
+    driver = asyncio.create_task(bench.clock.run())
+    yield bench
     driver.cancel()
     with suppress(asyncio.CancelledError):
         await driver
 
 
-async def test_when_the_wait_is_over_every_part_of_the_camera_is_within_the_band(room: Room) -> None:
-    cooling = room.switched_off()
-    assert room.excess_K > 15.0
-    await cool_down(cooling, BAND_K, TIME_CONSTANT_S, 7200.0, room.hub, room.clock)
-    assert 0.0 <= room.excess_K < BAND_K
-    assert room.waited_s == pytest.approx(CoolDown(BAND_K, TIME_CONSTANT_S, 7200.0).needed_s, rel=0.05)
-    assert [event.kind for event in room.events] == ["cooled_down"]
+async def test_when_the_wait_is_over_every_part_of_the_camera_is_within_the_band(bench: Cooling) -> None:
+    cooling = bench.switched_off()
+    assert bench.excess_K > 15.0
+    await cool_down(cooling, BAND_K, TIME_CONSTANT_S, 7200.0, bench.hub, bench.clock)
+    assert 0.0 <= bench.excess_K < BAND_K
+    assert bench.waited_s == pytest.approx(CoolDown(BAND_K, TIME_CONSTANT_S, 7200.0).needed_s, rel=0.05)
+    assert [event.kind for event in bench.events] == ["cooled_down"]
 
 
-async def test_a_cold_camera_is_not_waited_for(room: Room) -> None:
-    cooling = CameraTemperature(room.plant.air_degC + 0.4, room.clock.now_ns())
-    await cool_down(cooling, BAND_K, TIME_CONSTANT_S, 7200.0, room.hub, room.clock)
-    assert room.waited_s == 0.0
+async def test_a_cold_camera_is_not_waited_for(bench: Cooling) -> None:
+    cooling = CameraTemperature(bench.plant.air_degC + 0.4, bench.clock.now_ns())
+    await cool_down(cooling, BAND_K, TIME_CONSTANT_S, 7200.0, bench.hub, bench.clock)
+    assert bench.waited_s == 0.0
 
 
-async def test_the_wait_ends_at_its_limit_and_says_that_the_camera_is_still_warm(room: Room) -> None:
-    await cool_down(room.switched_off(), BAND_K, TIME_CONSTANT_S, 600.0, room.hub, room.clock)
-    assert room.waited_s == pytest.approx(600.0)
-    assert [(event.level, event.kind) for event in room.events] == [("warning", "cool_down_unsure")]
-    assert "continuing outside 0.5 K" in room.events[0].text
+async def test_the_wait_ends_at_its_limit_and_says_that_the_camera_is_still_warm(bench: Cooling) -> None:
+    await cool_down(bench.switched_off(), BAND_K, TIME_CONSTANT_S, 600.0, bench.hub, bench.clock)
+    assert bench.waited_s == pytest.approx(600.0)
+    assert [(event.level, event.kind) for event in bench.events] == [("warning", "cool_down_unsure")]
+    assert "continuing outside 0.5 K" in bench.events[0].text
 
 
-async def test_a_camera_that_showed_no_temperature_is_given_all_the_time(room: Room) -> None:
-    await cool_down(None, BAND_K, TIME_CONSTANT_S, 7200.0, room.hub, room.clock)
-    assert room.waited_s == pytest.approx(7200.0)
-    assert [(event.level, event.kind) for event in room.events] == [("warning", "cool_down_unsure")]
+async def test_a_camera_that_showed_no_temperature_is_given_all_the_time(bench: Cooling) -> None:
+    await cool_down(None, BAND_K, TIME_CONSTANT_S, 7200.0, bench.hub, bench.clock)
+    assert bench.waited_s == pytest.approx(7200.0)
+    assert [(event.level, event.kind) for event in bench.events] == [("warning", "cool_down_unsure")]
 
 
-async def test_air_that_nobody_measures_does_not_make_a_camera_cold(room: Room) -> None:
+async def test_air_that_nobody_measures_does_not_make_a_camera_cold(bench: Cooling) -> None:
     hub = Hub()
     hub.publish(Batch("thermometers", 0, (bad_reading("thermometers.air", "degC", 0, "open"),)))
     events: list[Item] = []
     hub.subscribe(events.append)
-    await cool_down(room.switched_off(), BAND_K, TIME_CONSTANT_S, 900.0, hub, room.clock)
-    assert room.waited_s == pytest.approx(900.0)
+    await cool_down(bench.switched_off(), BAND_K, TIME_CONSTANT_S, 900.0, hub, bench.clock)
+    assert bench.waited_s == pytest.approx(900.0)
     assert "is not measured" in events[0].text
 
 

@@ -34,7 +34,7 @@ def of(cameras: int, **changes: object) -> StandConfig:
     return parse_document(yaml.safe_dump(data), StandConfig, "stand")
 
 
-def test_between_two_packets_of_one_camera_there_is_room_for_one_of_each_other():
+def test_between_two_packets_of_one_camera_one_of_each_other_fits():
     on_wire_ns = 8038 * 8  # a byte takes 8 ns at 1 Gbit/s, and Ethernet adds 38 to a packet
     assert compute_packet_delay_ns(8000, 1000.0, 1) == 0
     assert compute_packet_delay_ns(8000, 1000.0, 3) == pytest.approx(2 * on_wire_ns, rel=0.11)
@@ -58,7 +58,7 @@ def test_three_cameras_of_5_MP_at_2_frames_a_second_fit_on_one_line():
     assert str(lines[0]).startswith("camera: 3 on a line of 1000 Mbit/s, 141.5 us between packets of 8000 bytes")
 
 
-def test_what_the_line_does_not_carry_is_refused_before_the_night():
+def test_what_the_line_does_not_carry_is_refused_before_the_session():
     with pytest.raises(ConfigError, match="1000 Mbit/s that 16 cameras"):
         price_plan(parse_document(RECIPE, Recipe, "recipe").plan(), of(16))
     with pytest.raises(ConfigError, match="100 Mbit/s that 3 cameras"):

@@ -71,7 +71,7 @@ async def test_in_real_time_they_expose_together():
     assert [frame.time_ns - due_ns for frame in frames] == [0, 0]
 
 
-async def test_when_one_is_lost_there_is_a_frame_of_none_until_all_are_open_again(
+async def test_when_one_is_lost_no_frames_are_taken_until_all_are_open_again(
     pair: tuple[Camera, Camera, Cameras],
 ):
     one, other, cameras = pair

@@ -79,7 +79,7 @@ def test_the_arrival_is_that_of_the_integrated_equation(gap_K: float):
     assert response.arrival_s(gap_K) == pytest.approx(arrival_s, abs=3.0)
 
 
-def test_within_the_band_there_is_nothing_to_wait_for():
+def test_within_the_band_nothing_is_waited_for():
     assert HEATING.arrival_s(0.5) == 0.0
     assert ChamberModel().settled_s(24.0, 24.3) == 0.0
 
@@ -89,8 +89,8 @@ def test_the_camera_follows_for_two_time_constants():
     assert model.settled_s(24.0, 31.0) == pytest.approx(HEATING.arrival_s(7.0) + 1400.0)
 
 
-async def test_a_recorded_night_teaches_both_directions_and_the_camera(tmp_path: Path):
-    session = await recorded(tmp_path / "night")
+async def test_a_recorded_session_teaches_both_directions_and_the_camera(tmp_path: Path):
+    session = await recorded(tmp_path / "cycle")
     model = fit_chamber_model(extract_ramps(session))
     assert (model.heating_ramps, model.cooling_ramps, model.camera_ramps) == (3, 2, 5)  # 1 K is no ramp
     for gap_K in (7.0, 14.0, 40.0):

@@ -1,4 +1,4 @@
-"""Every temperature against itself: good nights are left alone, and what jumps, scatters, sticks or cannot be is
+"""Every temperature against itself: good sessions are left alone, and what jumps, scatters, sticks or cannot be is
 doubted, said and recorded."""
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ AIR, GRANITE, PV, LABORATORY = (
 
 
 @pytest.mark.parametrize("seeds", [range(4, 8), mark_nightly(range(100, 200))], ids=["four", "a hundred"])
-def test_in_good_nights_no_temperature_is_doubted(seeds: range):
+def test_in_good_sessions_no_temperature_is_suspect(seeds: range):
     for seed in seeds:
         chamber, actions = draw_good_run(seed)
         for _ in iterate_timed(chamber, actions):
@@ -44,7 +44,7 @@ def offset(kelvins: float) -> Action:
     [(Shown(), 10.0), (Shown("nac", 0.5, 0.02), -4.0), (Shown("phone", 1.0), 5.0), (Shown("dic", 0.1, 0.1), 3.0)],
     ids=["10 K", "-4 K in steps of 0.5 K", "5 K in steps of 1 K", "3 K and noise"],
 )
-def test_a_camera_that_is_wrong_for_40_s_is_doubted_for_40_s(shown: Shown, kelvins: float):
+def test_a_camera_that_is_wrong_for_40_s_is_suspect_for_40_s(shown: Shown, kelvins: float):
     """On a ramp and at rest; each reading in between, and the frame before the next reading."""
     chamber = CheckedChamber(2, shown, camera_powered=True)
     wrong: list[bool] = []
@@ -100,16 +100,16 @@ def test_what_moves_at_one_instant_is_one_event_that_names_what_they_share(
     assert set(found.data["channels"]) == channels  # type: ignore[call-overload]
     assert {"module", "exchanged", "together_with"} & set(found.data) == ({key} if key else set())
     assert sum(rule == each for each, _ in chamber.warnings) == 1
-    assert all((latest := chamber.hub.latest(name)) and latest.cause == "doubt" for name in channels)
+    assert all((latest := chamber.hub.latest(name)) and latest.cause == "suspect" for name in channels)
 
 
 class Fed:
     """A camera in air, fed by hand every 5 s."""
 
     def __init__(self, excess_K: tuple[float, float]) -> None:
-        self.said: list[Event] = []
+        self.events: list[Event] = []
         natures = {AIR: ChannelModel((-40, 100)), CAMERA: ChannelModel((-40, 120), 600.0, AIR, excess_K)}
-        check = ChannelCheck(natures, SensorsConfig(), self.said.append)
+        check = ChannelCheck(natures, SensorsConfig(), self.events.append)
         self._marks = {name: check.make_marker(name) for name in natures}  # each a device of its own
         self._now_s = 0
 
@@ -127,18 +127,18 @@ class Fed:
 
 
 @pytest.mark.parametrize(
-    ("expected_K", "camera_degC", "is_doubted"),
+    ("expected_K", "camera_degC", "is_suspect"),
     [((0.0, float("inf")), 16.0, True), ((0.0, float("inf")), 54.0, False), ((10.0, 25.0), 54.0, True)],
     ids=["colder than its air", "warm, nothing stated", "warmer than stated"],
 )
 def test_one_that_is_wrong_from_the_begin_is_found_where_physics_or_the_file_says_so(
-    expected_K: tuple[float, float], camera_degC: float, is_doubted: bool
+    expected_K: tuple[float, float], camera_degC: float, is_suspect: bool
 ):
     fed = Fed(expected_K)
     assert fed.run(1700, lambda s: camera_degC, lambda s: 24.0).quality is Quality.GOOD
     last = fed.run(200, lambda s: camera_degC, lambda s: 24.0)
-    assert (last.quality is Quality.STALE) is is_doubted
-    assert [event.data["rule"] for event in fed.said] == (["sensor_implausible"] if is_doubted else [])
+    assert (last.quality is Quality.STALE) is is_suspect
+    assert [event.data["rule"] for event in fed.events] == (["sensor_implausible"] if is_suspect else [])
 
 
 def test_a_display_at_rest_is_not_stuck_and_one_that_does_not_follow_the_air_is():
@@ -147,8 +147,8 @@ def test_a_display_at_rest_is_not_stuck_and_one_that_does_not_follow_the_air_is(
     assert fed.run(9000, lambda s: 44.5, lambda s: 24.0).quality is Quality.GOOD
     assert fed.run(900, lambda s: 44.5, lambda s: min(36.0, 24 + s / 50)).quality is Quality.GOOD
     last = fed.run(600, lambda s: 44.5, lambda s: 36.0)
-    assert (last.quality, last.cause) == (Quality.STALE, "doubt")
-    assert fed.said[-1].data["rule"] == "sensor_stale"
+    assert (last.quality, last.cause) == (Quality.STALE, "suspect")
+    assert fed.events[-1].data["rule"] == "sensor_stale"
     assert fed.run(10, lambda s: 50.0, lambda s: 36.0).quality is Quality.GOOD
 
 
@@ -157,10 +157,10 @@ def test_noise_is_one_message_and_outside_the_range_is_another():
     fed.run(300, lambda s: 44.0, lambda s: 24.0)
     assert fed.run(300, lambda s: 44.0 + (0.9 if s % 10 else -0.9), lambda s: 24.0).quality is Quality.STALE
     assert fed.run(300, lambda s: 44.0, lambda s: 24.0).quality is Quality.GOOD
-    assert [(event.kind, event.data["rule"]) for event in fed.said] == [
+    assert [(event.kind, event.data["rule"]) for event in fed.events] == [
         ("guard.sensor_noisy", "sensor_noisy"),
         ("sensor_believed", "sensor_noisy"),
     ]
     fed = Fed((0.0, float("inf")))
     assert fed.run(10, lambda s: 150.0, lambda s: 24.0).quality is Quality.STALE
-    assert fed.said[0].data["rule"] == "sensor_outside"
+    assert fed.events[0].data["rule"] == "sensor_outside"

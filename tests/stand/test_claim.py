@@ -109,12 +109,12 @@ async def test_any_device_in_use_keeps_the_whole_stand_from_being_touched(tmp_pa
     mine[section] = theirs[section]
     theirs_ = config("laboratory", bus={"address": "tcp:192.0.2.1:502"}, **theirs)
     mine_ = config("laboratory", bus={"address": "tcp:192.0.2.2:502"}, **mine)
-    async with lock_stand(without_rotary(theirs_), tmp_path / "night"):
+    async with lock_stand(without_rotary(theirs_), tmp_path / "cycle"):
         with pytest.raises(InUse) as refused:
             async with lock_stand(without_rotary(mine_), tmp_path / "other"):
                 pass
         assert refused.value.device == name
-        assert f"session {tmp_path / 'night'} (pid {os.getpid()}); nothing was touched" in str(refused.value)
+        assert f"session {tmp_path / 'cycle'} (pid {os.getpid()}); nothing was touched" in str(refused.value)
         assert await is_free(bus("tcp:192.0.2.2:502"))  # what it had already is free again
     assert await is_free(mine_)
 
@@ -128,15 +128,15 @@ def test_simulated_laboratories_have_the_same_serial_numbers_and_are_not_the_sam
 
 async def test_the_locks_say_who_has_them_to_their_user_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    async with lock_stand(config(), tmp_path / "night"):
+    async with lock_stand(config(), tmp_path / "cycle"):
         files = list((tmp_path / "thermostand").iterdir())
-        said = [json.loads(file.read_text()) for file in files]
+        answers = [json.loads(file.read_text()) for file in files]
     assert {stat.S_IMODE((tmp_path / "thermostand").stat().st_mode)} == {0o700}
-    assert len(said) >= 5
-    assert all((each["session"], each["pid"]) == (str(tmp_path / "night"), os.getpid()) for each in said)
-    assert all(each["stand"] == "simulated-stand" for each in said)
+    assert len(answers) >= 5
+    assert all((each["session"], each["pid"]) == (str(tmp_path / "cycle"), os.getpid()) for each in answers)
+    assert all(each["stand"] == "simulated-stand" for each in answers)
     bus = config().bus.address.removeprefix("tcp:")
-    assert any(each["place"].startswith(f"tcp {bus}") for each in said)
+    assert any(each["place"].startswith(f"tcp {bus}") for each in answers)
     assert list((tmp_path / "thermostand").iterdir()) == []
 
 
@@ -166,19 +166,19 @@ async def test_in_a_folder_of_its_group_nobody_else_takes_the_locks_of_a_real_st
         assert not await is_free(stand)
         folder.mkdir()
         folder.chmod(0o2770)
-        async with lock_stand(stand, tmp_path / "night"):
+        async with lock_stand(stand, tmp_path / "cycle"):
             assert {stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()} == {0o660}
-            with pytest.raises(InUse, match=f"in use by session {tmp_path / 'night'}"):
+            with pytest.raises(InUse, match=f"in use by session {tmp_path / 'cycle'}"):
                 async with lock_stand(stand, tmp_path / "other"):
                     pass
     assert list(folder.iterdir()) == []
     folder.chmod(0o2777)
     with pytest.raises(SessionError, match="root has made"):
-        async with lock_stand(stand, tmp_path / "night"):
+        async with lock_stand(stand, tmp_path / "cycle"):
             pass
 
 
-async def test_a_runtime_folder_that_cannot_be_used_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+async def test_a_runtime_folder_that_cannot_be_used_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "thermostand").touch()
     with pytest.raises(SessionError, match="set XDG_RUNTIME_DIR"):
@@ -193,7 +193,7 @@ from thermostand.stand.config.stand_config import load_config
 from thermostand.stand.running.opening.stand_lock import lock_stand
 
 async def run():
-    async with lock_stand(load_config(Path(sys.argv[1])), Path("/their/night")):
+    async with lock_stand(load_config(Path(sys.argv[1])), Path("/their/cycle")):
         print("has it", flush=True)
         await asyncio.Event().wait()
 
@@ -227,9 +227,9 @@ async def test_of_several_that_begin_at_once_one_gets_it_and_its_death_gives_it_
     tmp_path: Path, start: Callable[[], "subprocess.Popen[str]"]
 ):
     processes = [start() for _ in range(3)]
-    said = {process.pid: process.stdout.readline() for process in processes if process.stdout is not None}
-    (holder,) = [process for process in processes if said.pop(process.pid) == "has it\n"]
-    assert all(f"session /their/night (pid {holder.pid})" in line for line in said.values())
+    answers = {process.pid: process.stdout.readline() for process in processes if process.stdout is not None}
+    (holder,) = [process for process in processes if answers.pop(process.pid) == "has it\n"]
+    assert all(f"session /their/night (pid {holder.pid})" in line for line in answers.values())
     holder.send_signal(signal.SIGSTOP)
     assert not await is_free(config())
     holder.kill()

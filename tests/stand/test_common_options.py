@@ -133,7 +133,7 @@ def test_an_error_is_json_where_that_was_asked_for(program: str, words: str, sta
     assert (plain.exit_code, plain.stdout) == (status, "")
 
 
-# What each command is told besides the session that is not there.
+# What each command is reported besides the session that is not there.
 OF_A_SESSION = {
     "stand resume": "",
     **{f"stand {verb}": "" for verb in ("status", "watch", "foxglove", "pause", "continue", "reset", "stop")},
@@ -156,7 +156,7 @@ OF_A_SESSION = {
 
 
 @pytest.mark.parametrize(("typed", "more"), OF_A_SESSION.items(), ids=list(OF_A_SESSION))
-def test_a_session_that_is_not_there_has_one_status_in_both_programs(typed: str, more: str, tmp_path, monkeypatch):
+def test_a_missing_session_has_one_status_in_both_programs(typed: str, more: str, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     program, *words = typed.split()
     asked = CliRunner().invoke(PROGRAMS[program], [*words, "nowhere", *more.split()])

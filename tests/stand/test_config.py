@@ -345,7 +345,7 @@ def test_optics_that_cannot_be_are_refused_with_a_sentence(tmp_path: Path, camer
         load_config(file)
 
 
-def test_optics_beside_the_stands_file_come_first(tmp_path: Path):
+def test_optics_in_the_folder_of_the_stands_file_come_first(tmp_path: Path):
     data = yaml.safe_load((CONFIGS / "simulated.yaml").read_text())
     data["simulation"]["cameras"] = {"camera": {"optics": "own.yaml", "effects": ["creep", "sag"], "drawn": 7}}
     (tmp_path / "own.yaml").write_text((CONFIGS / "optics" / "nac.yaml").read_text())
@@ -356,6 +356,6 @@ def test_optics_beside_the_stands_file_come_first(tmp_path: Path):
     assert simulation.cameras["camera"].optics == str(tmp_path / "own.yaml")
 
 
-def test_a_missing_file_lists_what_there_is():
+def test_a_missing_file_lists_the_existing_ones():
     with pytest.raises(ConfigError, match=r"thermal_cycle: no such file.*calibration, demo, .*warm-up"):
         find_packaged("recipes", "thermal_cycle")

@@ -43,7 +43,7 @@ def session(root: Path, name: str) -> Path:
 
 
 async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
-    path = session(tmp_path, "night")
+    path = session(tmp_path, "cycle")
     async with serve_fake(FakeService(run=STATUS), path):
         lines = (await invoke("status", tmp_path)).stdout.splitlines()
         reported = json.loads((await invoke("status", path, "--json")).stdout)
@@ -67,7 +67,7 @@ async def test_status_tells_all_of_the_run_in_lines_and_as_json(tmp_path: Path):
 
 @pytest.mark.parametrize("run", [STATUS, None])
 async def test_status_begins_with_what_is_not_confirmed_safe(tmp_path: Path, run: RunStatus | None):
-    path, failure = session(tmp_path, "night"), "relays did not confirm its safe state: relays: no answer"
+    path, failure = session(tmp_path, "cycle"), "relays did not confirm its safe state: relays: no answer"
     async with serve_fake(FakeService(run=run), path) as desk:
         desk.not_confirmed = (NotConfirmed(name="relays", since_ns=STATUS.since_ns, reason=failure, timer_s=15.0),)
         lines = (await invoke("status", path)).stdout.splitlines()
@@ -82,7 +82,7 @@ def test_status_tells_utc_when_the_system_clock_was_stepped_after_the_present_st
     stepped = STATUS.model_copy(
         update={"utc_offset_ns": hour_ns, "warning_ns": STATUS.since_ns, "warning_utc_offset_ns": -hour_ns}
     )
-    lines = [line for line in format_status_lines(Path("night"), stepped) if " UTC" in line]
+    lines = [line for line in format_status_lines(Path("cycle"), stepped) if " UTC" in line]
     assert lines == [
         "state         held: disk_low, operator, since 2026-01-01 17:59:00 UTC (0:01:00)",
         "ends          2026-01-01 20:00:00 UTC (in 1:00:00)",
@@ -95,7 +95,7 @@ def test_the_board_keeps_the_offset_to_utc_that_held_when_its_state_began_and_it
     clock = host.clock()
     recorder: Any = SimpleNamespace(saved=SimpleNamespace(frames=0, frames_lost=0), disk_free_bytes=0)
     board = StatusBoard(
-        "night", PlanEstimate(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder=recorder, clock=clock
+        "cycle", PlanEstimate(()), RunState(()), gate, Stop(), Latch(gate, Hub(), clock), recorder=recorder, clock=clock
     )
     host.step(3600)
     board(Event(clock.now_ns(), "warning", "odd", "it is so"))
@@ -110,7 +110,7 @@ def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
     soaked: list[float | None] = [720.0, None]
     clock, gate = Host().clock(), Gate()
     board = StatusBoard(
-        "night",
+        "cycle",
         PlanEstimate(()),
         RunState(()),
         gate,
@@ -125,7 +125,7 @@ def test_the_board_says_that_a_camera_soaks_again_and_for_how_long():
 
 
 async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_path: Path):
-    path = session(tmp_path, "night")
+    path = session(tmp_path, "cycle")
     async with serve_fake(FakeService("interlock", run=STATUS), path) as desk:
         assert "paused" in (await invoke("pause", tmp_path)).stdout
         assert desk.gate.reasons == {"operator", "interlock"}
@@ -159,18 +159,20 @@ async def test_each_command_does_its_own_and_says_what_still_holds_the_run(tmp_p
 
 
 async def test_the_plan_and_what_happens_are_shown(tmp_path: Path):
-    path = session(tmp_path, "night")
+    path = session(tmp_path, "cycle")
     async with serve_fake(FakeService(run=STATUS), path):
         assert (await invoke("status", path, "--plan")).stdout == "    1  waiting     soak\n"
 
 
-@pytest.mark.parametrize(("moving", "said"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "paused")])
-async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: tuple[str, ...], said: str):
-    path, desk = session(tmp_path, "night"), FakeService(run=STATUS)
+@pytest.mark.parametrize(
+    ("moving", "sentence"), [(("linear to 250 mm", "flap opening"), "still moving"), ((), "paused")]
+)
+async def test_a_pause_says_what_still_moves(tmp_path: Path, moving: tuple[str, ...], sentence: str):
+    path, desk = session(tmp_path, "cycle"), FakeService(run=STATUS)
     desk.moving = moving
     async with serve_fake(desk, path):
         text = (await invoke("pause", tmp_path)).stdout
-        assert said in text
+        assert sentence in text
         assert all(each in text for each in moving)
         assert (await asyncio.to_thread(ask, path, "pause"))["moving"] == list(moving)
 
@@ -194,14 +196,14 @@ async def test_the_recording_directory_of_the_configuration_is_searched(tmp_path
     config = tmp_path / "stand.yaml"
     config.write_text(yaml.safe_dump(data))
     (tmp_path / "recordings").mkdir()
-    path = session(tmp_path / "recordings", "night")
+    path = session(tmp_path / "recordings", "cycle")
     async with serve_fake(FakeService(run=STATUS), path):
         found = await invoke("status", "--config", config)
     assert str(path) in found.stdout
 
 
-async def test_a_session_that_has_ended_is_said_to(tmp_path: Path):
-    path = session(tmp_path, "night")
+async def test_a_session_that_has_ended_is_reported_as_ended(tmp_path: Path):
+    path = session(tmp_path, "cycle")
     (path / "telemetry").mkdir()
     (path / "telemetry" / "0001.mcap").touch()
     result = await invoke("stop", path)

@@ -59,7 +59,7 @@ def test_what_was_not_read_is_not_counted():
     assert counters.values["compressor_starts"] == 0
 
 
-async def test_counters_are_there_for_the_next_daemon(tmp_path: Path):
+async def test_counters_are_kept_for_the_next_daemon(tmp_path: Path):
     kept = CountersFile(tmp_path, lambda function, *arguments: function(*arguments), Hub(), WallClock())
     last = StoredCounters(counters={"flap_cycles": 3.0})
     kept.note(StoredCounters(counters={"flap_cycles": 1.0}))
@@ -106,7 +106,7 @@ def test_the_service_manager_is_notified_in_lines(manager: socket.socket, monkey
     assert systemd.watchdog_s() is None
 
 
-def test_what_is_done_is_told_to_the_service_manager_when_it_changes(manager: socket.socket):
+def test_what_is_done_is_reported_to_the_service_manager_when_it_changes(manager: socket.socket):
     status = systemd.StatusNotice()
     for text in ("idle", "idle", "heat by hand", "idle"):
         status.tell(text)

@@ -19,7 +19,7 @@ USES = [("export", "--out"), ("trim", "--out"), ("replay", "--record")]
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A complete run; not to be changed."""
-    directory = tmp_path_factory.mktemp("sessions") / "night-1"
+    directory = tmp_path_factory.mktemp("sessions") / "cycle-1"
     asyncio.run(record_run(directory))
     return directory
 
@@ -46,8 +46,8 @@ def words_everywhere(session: Path, status: int) -> tuple[str, str]:
     known = json.loads(ask("info", session, "--json").stdout)
     assert (listed["run"], listed["files"]) == (known["run"], known["files"]) == words
     assert f" {words[0]} {words[1]}" in " ".join(ask("list", session).stdout.splitlines()[1].split())
-    said = " ".join(ask("info", session).stdout.split())
-    assert f"run {words[0]} files {words[1]} " in said
+    answer = " ".join(ask("info", session).stdout.split())
+    assert f"run {words[0]} files {words[1]} " in answer
     return words
 
 
@@ -65,17 +65,17 @@ def test_a_run_that_did_not_come_to_its_end_has_its_word_and_sound_files(tmp_pat
 def test_steps_are_counted_when_they_are_done_and_against_the_plan(tmp_path: Path):
     asyncio.run(record_run(tmp_path / "s", items=publish_half_done, status=""))
     write_journal(tmp_path / "s", *entries(SECONDS // 2, "stopped"))
-    said = " ".join(ask("info", tmp_path / "s").stdout.split())
-    assert "steps 10 of 20 done: 10 capture" in said
-    assert "not done 10 capture frames=1 interval_s=0.5" in said
+    answer = " ".join(ask("info", tmp_path / "s").stdout.split())
+    assert "steps 10 of 20 done: 10 capture" in answer
+    assert "not done 10 capture frames=1 interval_s=0.5" in answer
 
 
 def test_segments_deleted_from_the_end_make_a_complete_run_incomplete(session: Path):
     remove(session, "telemetry", 4, 5)
     remove(session, "frames", 3, 4)
     assert words_everywhere(session, 1) == ("complete", "incomplete")
-    said = " ".join(ask("info", session).stdout.split())
-    assert "missing telemetry/0004.mcap: is missing" in said
+    answer = " ".join(ask("info", session).stdout.split())
+    assert "missing telemetry/0004.mcap: is missing" in answer
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_what_is_lost_in_a_damaged_segment_is_not_looked_for_behind_the_last_one
 
 
 def test_damaged_notes_are_named_by_all(session: Path):
-    ask("note", session, "a cloudy night")
+    ask("note", session, "a cloudy day")
     ask("tag", session, "keep")
     flip(session / "notes.jsonl", 40)
     assert words_everywhere(session, 1) == ("complete", "damaged")

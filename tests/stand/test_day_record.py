@@ -119,8 +119,8 @@ async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_ta
     open_stand: tuple[IdleLog, Hub, Calendar], tmp_path: Path
 ):
     record, hub, clock = open_stand
-    said: list[Event] = []
-    hub.subscribe(lambda item: said.append(item) if isinstance(item, Event) else None)
+    warned: list[Event] = []
+    hub.subscribe(lambda item: warned.append(item) if isinstance(item, Event) else None)
     names: list[str] = []
     for _ in range(4):
         names.append((await record.begin()).directory.name)
@@ -135,8 +135,8 @@ async def test_old_records_between_runs_are_removed_but_none_with_a_note_or_a_ta
     assert remove_idle_logs(tmp_path, today, 30) == []
     clock.ahead_ns += 91 * 24 * 3600 * NS_PER_S
     latest = (await record.begin()).directory.name
-    while not any(event.kind == "idle_logs_removed" for event in said):
+    while not any(event.kind == "idle_logs_removed" for event in warned):
         await asyncio.sleep(0.01)
-    assert next(event for event in said if event.kind == "idle_logs_removed").data["names"] == [names[0], names[2]]
+    assert next(event for event in warned if event.kind == "idle_logs_removed").data["names"] == [names[0], names[2]]
     kept = sorted(path.name for path in tmp_path.iterdir())
     assert kept == sorted(["20200101-idle-log", "20200101-overnight", names[1], names[3], latest])

@@ -87,7 +87,7 @@ def test_visits_are_decided_until_enough_is_known(life: Callable[..., Life], tmp
     assert fold(PLAN, entries).plan == here.log.state.plan
 
 
-def test_a_killed_night_decides_the_same_and_asks_for_nothing_twice(life: Callable[..., Life], tmp_path: Path):
+def test_a_killed_session_decides_the_same_and_asks_for_nothing_twice(life: Callable[..., Life], tmp_path: Path):
     answers = visit(47.0, 120.0), visit(12.0, 60.0), visit(33.0, 60.0), ENOUGH
     first = life(*answers)
     while not (tmp_path / ASKED).exists():
@@ -135,7 +135,7 @@ def test_a_daemon_that_is_killed_during_the_fit_asks_the_same_again(life: Callab
     assert len(asked) == 4
 
 
-def test_without_decisions_the_fixed_plan_goes_on_and_it_is_said(life: Callable[..., Life]):
+def test_without_decisions_the_fixed_plan_goes_on_and_that_is_reported(life: Callable[..., Life]):
     here = life(visit(47.0, 120.0), *["die"] * 2, *[{"kind": "none", "reason": "too few frames"}] * 8)
     here.passes(8 * 700.0)
     assert here.run.done()

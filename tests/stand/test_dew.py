@@ -87,7 +87,7 @@ def test_no_set_point_changes_faster_than_a_camera_allows(tmp_path: Path):
     assert estimate_return_s(plan, fast, LearnedDurations()) < 11.0 / 0.5 * 60.0
 
 
-class Night:
+class Evening:
     """The guard's rules over a hub, the laboratory at 24 degC and 50 %: its dew point is 12.9 degC."""
 
     def __init__(self, folder: Path, **sections: object):
@@ -112,15 +112,15 @@ class Night:
 
 
 def test_an_open_flap_over_a_cold_target_holds_and_a_closed_one_does_not(tmp_path: Path):
-    night = Night(tmp_path)
-    assert [night.look(at_s, 0.0, 10.0) for at_s in (0, 20)] == [[], []]
-    assert [night.look(at_s, 1.0, 14.2) for at_s in (21, 40)] == [[], []]
-    assert night.look(50, 1.0, 13.5) == []
-    (fault,) = night.look(61, 1.0, 13.5)
+    evening = Evening(tmp_path)
+    assert [evening.look(at_s, 0.0, 10.0) for at_s in (0, 20)] == [[], []]
+    assert [evening.look(at_s, 1.0, 14.2) for at_s in (21, 40)] == [[], []]
+    assert evening.look(50, 1.0, 13.5) == []
+    (fault,) = evening.look(61, 1.0, 13.5)
     assert fault.action == "hold"
     assert fault.text.startswith("thermometers.artifact is 13.50 degC")
-    assert night.look(62, 0.0, 13.5) == []
-    assert [len(night.look(at_s, 1.0, 20.0, 5.0)) for at_s in (70, 81)] == [0, 1]
+    assert evening.look(62, 0.0, 13.5) == []
+    assert [len(evening.look(at_s, 1.0, 20.0, 5.0)) for at_s in (70, 81)] == [0, 1]
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_what_a_hygrometer_measures_counts_and_what_is_given_while_it_tells_noth
     tmp_path: Path, humidity_percent: float | None, target_degC: float, rules: list[str]
 ):
     """At 24 degC 80 % has its dew point at 20.3, 50 % at 12.9, 20 % at -0.2 degC."""
-    night = Night(
+    evening = Evening(
         tmp_path,
         dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10, "hygrometer": "room"},
         probes={"room": {"protocol": "vaisala", "address": "tcp:127.0.0.1:1"}},
@@ -142,6 +142,6 @@ def test_what_a_hygrometer_measures_counts_and_what_is_given_while_it_tells_noth
         if humidity_percent is None
         else Reading("room.humidity", humidity_percent, "%", 0)
     )
-    night.hub.publish(Batch("room", 0, (reported, Reading("room.temperature", 24.0, "degC", 0))))
-    night.look(0, 1.0, target_degC)
-    assert [fault.rule for fault in night.look(11, 1.0, target_degC)] == rules
+    evening.hub.publish(Batch("room", 0, (reported, Reading("room.temperature", 24.0, "degC", 0))))
+    evening.look(0, 1.0, target_degC)
+    assert [fault.rule for fault in evening.look(11, 1.0, target_degC)] == rules

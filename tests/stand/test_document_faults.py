@@ -52,7 +52,7 @@ def test_a_wrong_number_is_reported_with_its_line_and_what_to_type(value: str, s
         ("colour", "colour: unknown key; correct its name, or take it out; known here: address,"),
     ],
 )
-def test_an_unknown_key_is_reported_with_the_one_that_may_be_meant_or_those_there_are(key: str, sentence: str):
+def test_an_unknown_key_is_reported_with_the_one_that_may_be_meant_or_all_known_ones(key: str, sentence: str):
     indent = EXPOSURE[: len(EXPOSURE) - len(EXPOSURE.lstrip())]
     reported = refusal(EXPOSURE, f"{EXPOSURE}\n{indent}{key}: 1")
     assert reported.startswith(f"mine.yaml: cameras.camera.{sentence}")
@@ -79,11 +79,11 @@ def test_keys_of_a_list_s_entries_are_known_too():
             "r.yaml: name: give text, in quotes: '2026-01-01' (got datetime.date(2026, 1, 1), line 1)",
         ),
         (
-            "name: night\nexperiments: 5",
+            "name: cycle\nexperiments: 5",
             "experiments: give a list: each entry behind a dash, or all in [ ] (got 5, line 2)",
         ),
-        ("name: night\nexperiments:\n\t- warm_up: {}", "(line 3, column 1); indent with spaces, not with tabs"),
-        ("name: night: 2", "mapping values are not allowed here (line 1, column 12); text with a colon"),
+        ("name: cycle\nexperiments:\n\t- warm_up: {}", "(line 3, column 1); indent with spaces, not with tabs"),
+        ("name: cycle: 2", "mapping values are not allowed here (line 1, column 12); text with a colon"),
         ("name: [a", "(line 1, column 9); a bracket is not closed"),
         ("name: 'a", "(line 1, column 9); a quotation mark is not closed"),
         ("name: a\x07", "the character number 8 must not be in a text"),
@@ -133,7 +133,7 @@ def parse_any(text: str) -> None:
 def test_a_file_that_is_named_wrongly_is_reported_with_the_file_and_key_that_name_it(
     tmp_path: Path, key: str, old: str, sentence: str
 ):
-    """When a night is planned, not when it is run."""
+    """When a session is planned, not when it is run."""
     file = tmp_path / "mine.yaml"
     text = find_packaged("", "simulated").read_text(encoding="utf-8")
     assert text.count(old) == 1, old
@@ -143,7 +143,7 @@ def test_a_file_that_is_named_wrongly_is_reported_with_the_file_and_key_that_nam
     assert str(refused.value).startswith(sentence.format(file))
 
 
-def test_files_beside_the_one_that_names_them_are_found_from_anywhere(tmp_path: Path):
+def test_files_named_relative_to_a_file_are_found_from_anywhere(tmp_path: Path):
     text = find_packaged("", "simulated").read_text(encoding="utf-8")
     (tmp_path / "maps").mkdir()
     registers = find_packaged("registers", "omron-e5cc").read_text(encoding="utf-8")

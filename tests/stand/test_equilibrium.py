@@ -100,7 +100,7 @@ async def test_a_camera_that_goes_on_moving_is_reported_and_waited_for():
         (True, "a", 40.0, "its equilibrium had been lost before", "its equilibrium had been lost before"),
     ],
 )
-def test_in_doubt_a_camera_was_off(was_supplied, boot_id, camera_degC, lost, text):
+def test_a_camera_of_unknown_supply_was_off(was_supplied, boot_id, camera_degC, lost, text):
     before = CameraHistory(CameraTemperature(40.0, 0), "a", lost)
     reading = Reading("camera.temperature", camera_degC, "degC", NS_PER_S)
     found = explain_possible_power_loss(before, boot_id, was_supplied, reading)

@@ -156,7 +156,7 @@ def test_how_warm_the_run_finds_the_camera_nobody_knows_before_a_run_has_shown_i
     assert first.duration_s == second.duration_s == pytest.approx(1480.0 * math.log(20.0))
     assert "camera that was on" in first.warning
     assert second.warning == ""
-    learned = LearnedDurations(overheads_s={first.work: -4423.6}, nights=("last",))
+    learned = LearnedDurations(overheads_s={first.work: -4423.6}, learned_from=("last",))
     cold, _, warm = price_plan(plan, config, learned)
     assert cold.duration_s == pytest.approx(10.0, abs=1.0)
     assert cold.warning == ""
@@ -178,7 +178,7 @@ def test_how_warm_the_run_finds_the_camera_nobody_knows_before_a_run_has_shown_i
         ("linear", (5, 280), CheckHome("linear"), "homing linear goes to 0 mm"),
     ],
 )
-def test_limits_that_exclude_what_homing_needs_are_found_before_the_night(
+def test_limits_that_exclude_what_homing_needs_are_found_before_the_session(
     config: StandConfig, axis: str, limits: tuple[float, float], step: Step, sentence: str
 ):
     data = config.model_dump()
@@ -228,7 +228,7 @@ def test_a_situation_is_what_the_steps_before_have_left(config: StandConfig):
     assert price_step(OpenFlap(), found, ConfiguredStand(config)).work == "flap at rest"
 
 
-def test_the_way_back_to_the_laboratory_is_part_of_the_night(config: StandConfig):
+def test_the_way_back_to_the_laboratory_is_part_of_the_session(config: StandConfig):
     plan = make_priced_plan(StartChamber(10.0), Soak(600.0), StopChamber())
     back = config.model_copy(update={"ending": config.ending.model_copy(update={"to_ambient": True})})
     after_s = estimate_return_s(plan, back, LearnedDurations())

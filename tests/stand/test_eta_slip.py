@@ -7,7 +7,7 @@ from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.stand.running.status import EtaSlip
 
 
-class Night:
+class Slip:
     """A run of ten hours whose end is set by the test."""
 
     def __init__(self):
@@ -23,21 +23,21 @@ class Night:
 
 
 def test_each_tenth_is_reported_once():
-    night = Night()
+    slip = Slip()
     for end_s in (36_000, 38_000, 39_600, 39_700, 43_100, 43_200, 40_000):
-        night.now_s += 60
-        night.end_s = end_s
-        night.mark()
-        night.mark()
-    assert [item.data["later_s"] for item in night.reported] == [3600.0, 3600.0]
-    assert night.reported[0].text.startswith("the run ends 60 min later")
-    assert night.reported[0].level == "info"
+        slip.now_s += 60
+        slip.end_s = end_s
+        slip.mark()
+        slip.mark()
+    assert [item.data["later_s"] for item in slip.reported] == [3600.0, 3600.0]
+    assert slip.reported[0].text.startswith("the run ends 60 min later")
+    assert slip.reported[0].level == "info"
 
 
 def test_a_hold_that_ends_and_a_changed_plan_are_looked_at_and_nothing_else():
-    night = Night()
-    night.end_s = 45_000
-    night.hub.publish(Event(0, "info", "note", "windy"))
-    assert night.reported == []
-    night.hub.publish(Event(0, "info", "released", "disk_low", {"reason": "disk_low"}))
-    assert len(night.reported) == 1
+    slip = Slip()
+    slip.end_s = 45_000
+    slip.hub.publish(Event(0, "info", "note", "windy"))
+    assert slip.reported == []
+    slip.hub.publish(Event(0, "info", "released", "disk_low", {"reason": "disk_low"}))
+    assert len(slip.reported) == 1

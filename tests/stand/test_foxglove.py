@@ -39,7 +39,7 @@ def state(air_degC: float, time_ns: int) -> StandState:
     )
 
 
-async def said(viewer: ClientConnection, wanted: str) -> dict[str, Any]:
+async def fetch(viewer: ClientConnection, wanted: str) -> dict[str, Any]:
     """The next message of that kind in JSON."""
     async with asyncio.timeout(20):
         while True:
@@ -74,10 +74,10 @@ async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot
         assert asked == []  # nobody looks
         url = f"ws://127.0.0.1:{port}"
         async with connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as viewer:
-            assert (await said(viewer, "serverInfo"))["capabilities"] == []
+            assert (await fetch(viewer, "serverInfo"))["capabilities"] == []
             channels: dict[str, int] = {}
             while len(channels) < 4:
-                channels |= {each["topic"]: each["id"] for each in (await said(viewer, "advertise"))["channels"]}
+                channels |= {each["topic"]: each["id"] for each in (await fetch(viewer, "advertise"))["channels"]}
             assert set(channels) == {"/state", "/events", "/camera", "/readings/thermometers"}
             numbers = {topic: number for number, topic in enumerate(channels, 1)}
             asks = [{"id": numbers[topic], "channelId": channel} for topic, channel in channels.items()]
@@ -104,15 +104,15 @@ async def test_a_viewer_gets_readings_state_events_and_the_last_frame_and_cannot
         published.close()
     time_ns, content = got[numbers["/readings/thermometers"]]
     assert (time_ns, json.loads(content)) == (NOW_NS + 1 + UTC_NS, {"air": 25.5, "granite": None})
-    told = json.loads(got[numbers["/state"]][1])
-    assert (told["setpoint_degC"], told["by_hand_setpoint_degC"]) == (30.0, 40.0)
+    snapshot = json.loads(got[numbers["/state"]][1])
+    assert (snapshot["setpoint_degC"], snapshot["by_hand_setpoint_degC"]) == (30.0, 40.0)
     assert b"too warm" in got[numbers["/events"]][1]
     assert got[numbers["/camera"]][0] == NOW_NS + UTC_NS
     assert b"a picture" in got[numbers["/camera"]][1]
     assert len(asked) == 2
 
 
-def test_a_port_that_is_taken_is_said_to():
+def test_a_taken_port_is_reported():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

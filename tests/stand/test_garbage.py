@@ -12,11 +12,11 @@ from thermostand.stand.serving.client import find_session_server
 from tests.stand.fake_service import FakeService, serve_fake
 
 async def main():
-    async with serve_fake(FakeService(), Path(sys.argv[1]) / "night") as desk:
+    async with serve_fake(FakeService(), Path(sys.argv[1]) / "cycle") as desk:
         for number in range(EVENTS + READINGS):
             desk.tell("a text", value=number) if number % 2 else desk.hub.publish(desk.batch(20.0))
             if number % 1000 == 0:
-                server = find_session_server(Path(sys.argv[1]) / "night")
+                server = find_session_server(Path(sys.argv[1]) / "cycle")
                 await asyncio.to_thread(server.request, "GET", "/api/v1/events", None)
         searched_s = []
         for _ in range(5):

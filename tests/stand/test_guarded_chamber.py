@@ -1,5 +1,5 @@
 """The guard's table on chambers that are not the simulator's standard one: hot air is found though both probes are
-wrong, and good nights are left alone."""
+wrong, and good sessions are left alone."""
 
 from collections.abc import Callable, Iterable
 
@@ -129,14 +129,14 @@ def test_the_air_stays_below_its_limit_in_every_failure(
 @pytest.mark.parametrize(
     ("recipe", "chamber_seed"), [("trial", 0), mark_nightly("demo", 0), mark_nightly("warm-up", 2)]
 )
-def test_a_good_night_is_left_alone(recipe: str, chamber_seed: int):
+def test_a_good_session_is_left_alone(recipe: str, chamber_seed: int):
     assert objections(Chamber(chamber_seed), Player(recipe, interrupted=True).actions()) == []
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("recipe", [*RECIPES, "big steps"])
-def test_no_good_night_of_ten_chambers_is_disturbed(recipe: str, record_property: Callable[[str, object], None]):
-    """Every other chamber's night with holds, pauses and a camera that was off in between."""
+def test_no_good_session_of_ten_chambers_is_disturbed(recipe: str, record_property: Callable[[str, object], None]):
+    """Every other chamber's session with holds, pauses and a camera that was off in between."""
     hours = 0.0
     for chamber_seed in CHAMBERS:
         chamber = Chamber(chamber_seed)

@@ -41,7 +41,7 @@ CHANGES = {
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A complete run of 20 frames in five segments of each series; not to be changed."""
-    return asyncio.run(record_run(tmp_path_factory.mktemp("sessions") / "night-1"))
+    return asyncio.run(record_run(tmp_path_factory.mktemp("sessions") / "cycle-1"))
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +72,14 @@ def words(command: tuple[str, ...], session: Path, out: Path) -> list[str]:
 def check(name: str, answer: Answer) -> None:
     """What holds for every command and every session."""
     assert answer.status in (0, 1, 2), (name, answer)
-    assert "Traceback" not in answer.said, (name, answer)
-    assert answer.said.strip(), name
+    assert "Traceback" not in answer.output, (name, answer)
+    assert answer.output.strip(), name
     assert answer.memory_bytes < MOST_BYTES, (name, answer)
     assert answer.seconds < LONGEST_S, (name, answer)
-    assert answer.seconds < SILENT_S or re.search(r"\d+%", answer.said), (name, answer)
-    assert "\x1b" not in answer.said, (name, answer)
+    assert answer.seconds < SILENT_S or re.search(r"\d+%", answer.output), (name, answer)
+    assert "\x1b" not in answer.output, (name, answer)
     if answer.status == 2:
-        assert "error: " in answer.said, (name, answer)
+        assert "error: " in answer.output, (name, answer)
 
 
 def check_verified(answer: Answer, expected: str) -> None:
@@ -87,7 +87,7 @@ def check_verified(answer: Answer, expected: str) -> None:
     if expected == NONE:
         assert answer.status == 2, answer
         return
-    assert re.findall(r"^files (\w+)", answer.said, re.MULTILINE) == [expected], answer
+    assert re.findall(r"^files (\w+)", answer.output, re.MULTILINE) == [expected], answer
     assert answer.status == (expected != SOUND), answer
 
 
@@ -114,7 +114,7 @@ def test_every_command_answers_on_a_hostile_session(row: str, whole: Path, tmp_p
             assert list(tmp_path.glob("*.part")) == [], (name, answer)
         if name in USES and row in WITH_HOLES:
             assert answer.status in (1, 2), (name, answer)
-            assert "--incomplete" in answer.said, (name, answer)
+            assert "--incomplete" in answer.output, (name, answer)
     again = ask_all(*words(CHANGES["repair"], session, tmp_path / "out"))
     check("salvage, once more", again)
     assert again.status in (0, 2), again  # what a first salvage could not recover a second one does not find

@@ -94,7 +94,7 @@ def test_nothing_in_it_is_a_path_of_this_computer(tmp_path: Path, more: tuple[st
     assert not [text for text in texts if str(Path(init_cli.__file__).parents[2]) in text]
 
 
-def test_nothing_that_is_there_is_overwritten(tmp_path: Path):
+def test_no_existing_file_is_overwritten(tmp_path: Path):
     (tmp_path / "recipe.yaml").write_text("mine")
     refused = invoke(tmp_path, "--simulated")
     assert (refused.exit_code, "is there already" in refused.stderr) == (2, True)
@@ -110,7 +110,7 @@ def test_options_that_mean_nothing_are_refused(tmp_path: Path, options: tuple[st
     assert not (tmp_path / "new").exists()
 
 
-def test_a_file_in_the_way_and_a_wrong_address_are_said_as_such(tmp_path: Path):
+def test_a_file_in_the_way_and_a_wrong_address_are_reported(tmp_path: Path):
     (tmp_path / "file").write_text("mine")
     refused = invoke(tmp_path / "file", "--no-ask")
     assert (refused.exit_code, "choose another folder" in refused.stderr) == (2, True)

@@ -34,7 +34,7 @@ CHANGES_NOTHING = (STOP_PATH, CHECK_PATH, INVITE_PATH)
 EVIL = "http://evil.example"
 # What a proxy adds: such a request is from elsewhere, and needs a token.
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
-NAMES = {"run": "1", "name": "flap", "device": "flap", "session": "night", "verb": "open"}
+NAMES = {"run": "1", "name": "flap", "device": "flap", "session": "cycle", "verb": "open"}
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",
@@ -73,7 +73,7 @@ async def open_stand(folder: Path, *, trusts_loopback: bool = True) -> AsyncIter
     port = free_port()
     hosts = ("stand.example",)
     interface = Interface(folder, port=port, tokens=book(wall=LOOKS), hosts=hosts, trusts_loopback=trusts_loopback)
-    async with serve_fake(FakeService(), folder / "night", interface) as desk:
+    async with serve_fake(FakeService(), folder / "cycle", interface) as desk:
         yield desk, port
 
 
@@ -215,11 +215,11 @@ async def test_bodies_are_limited_and_stop_needs_none(tmp_path: Path):
         status, _, _ = await asyncio.to_thread(_ask_large, port, pause, chunked)
         assert status in (0, 411)  # 0: cut off while it still sent
         for body in (b"{", b"[]", b'"x"', b'{"when": 3}', b'{"when": "never"}', b'{"else": 1}', b"\xff", b"[" * 10_000):
-            status, _, said = await asyncio.to_thread(ask, port, "POST", pause, {}, body)
+            status, _, body_text = await asyncio.to_thread(ask, port, "POST", pause, {}, body)
             assert status in (400, 422), body
-            assert json.loads(said)["error"]
+            assert json.loads(body_text)["error"]
             if body == b"{":
-                assert json.loads(said)["error"].startswith("the body: ")
+                assert json.loads(body_text)["error"].startswith("the body: ")
         assert desk.orders == []
         for body in (b"", b"\xff", b"x" * 100_000):
             assert (await asyncio.to_thread(ask, port, "POST", STOP_PATH, {}, body))[0] == 200
@@ -245,7 +245,7 @@ async def test_a_slow_client_is_not_waited_for_and_keeps_nobody(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-async def test_hostile_names_are_not_found_and_never_said_back_as_a_page(tmp_path: Path, name: str):
+async def test_hostile_names_are_not_found_and_never_echoed_as_a_page(tmp_path: Path, name: str):
     quoted = name.encode("ascii", "ignore").decode() or "x"
     (tmp_path / "secret").write_text("root")
     async with open_stand(tmp_path) as (_, port):
@@ -262,11 +262,11 @@ async def test_hostile_operators_and_texts_are_data(tmp_path: Path):
     async with open_stand(tmp_path) as (desk, port):
         desk.tell(script, operator=script, value=float("nan"))
         body = json.dumps({"text": script, "tags": [script]}).encode()
-        assert (await asyncio.to_thread(ask, port, "POST", "/api/v1/sessions/night/notes", {}, body))[0] == 200
-        _, headers, said = await asyncio.to_thread(ask, port, "GET", "/api/v1/events")
+        assert (await asyncio.to_thread(ask, port, "POST", "/api/v1/sessions/cycle/notes", {}, body))[0] == 200
+        _, headers, body_text = await asyncio.to_thread(ask, port, "GET", "/api/v1/events")
         assert headers["content-type"] == "application/json"
         assert headers["content-security-policy"] == CSP
-        assert json.loads(said)["events"][0]["data"] == {"operator": script, "value": None}
+        assert json.loads(body_text)["events"][0]["data"] == {"operator": script, "value": None}
 
 
 def test_a_wide_bind_without_a_token_is_refused(tmp_path: Path):
@@ -284,11 +284,11 @@ def test_a_wide_bind_without_a_token_is_refused(tmp_path: Path):
     assert TOKEN not in repr(Interface(tmp_path, tokens=book()))
 
 
-async def test_a_port_that_is_taken_is_said_to(tmp_path: Path):
+async def test_a_taken_port_is_reported(tmp_path: Path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         interface = Interface(tmp_path, port=taken.getsockname()[1])
         with pytest.raises(ConfigError, match="cannot listen at"):
-            async with serve_fake(FakeService(), tmp_path / "night", interface):
+            async with serve_fake(FakeService(), tmp_path / "cycle", interface):
                 pass
 
 

@@ -55,7 +55,7 @@ async def test_a_session_is_found_by_its_old_name_its_new_name_and_its_folder(tm
 
 async def test_two_daemons_with_one_name_are_distinguished_by_the_folder(tmp_path: Path):
     """The first one's session was renamed, and the next run took its name."""
-    session, away = tmp_path / "night", tmp_path / "renamed"
+    session, away = tmp_path / "cycle", tmp_path / "renamed"
     session.mkdir()
     async with serve_fake(FakeService("first"), session):
         await folder_stated(session)
@@ -164,7 +164,7 @@ def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentence(tmp_
 
 
 @pytest.mark.parametrize(
-    ("said", "sentence"),
+    ("reply", "sentence"),
     [
         (b"", "ended before it answered"),
         (b"HTTP/1.1 200 OK\r\ncontent-length: 100\r\n\r\n{", "sent an unknown reply"),
@@ -174,10 +174,10 @@ def test_a_folder_without_a_daemon_and_no_folder_at_all_have_their_sentence(tmp_
         (b"HTTP/1.1 409 Conflict\r\n\r\n[]", "sent an unknown reply"),
     ],
 )
-async def test_a_daemon_that_talks_nonsense_is_said_to(tmp_path: Path, said: bytes, sentence: str):
+async def test_a_daemon_that_talks_nonsense_is_reported(tmp_path: Path, reply: bytes, sentence: str):
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")
-        writer.write(said)
+        writer.write(reply)
         writer.close()
 
     presence = DaemonInstance(DaemonEntry(str(tmp_path), os.getpid(), STAND))

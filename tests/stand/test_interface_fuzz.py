@@ -107,7 +107,7 @@ def _of(prepared: Any) -> list[tuple[str, Any]]:
 async def test_no_request_by_the_document_or_against_it_makes_a_500(tmp_path: Path, examples: int):
     port = free_port()
     desk = FakeService("interlock")
-    async with serve_fake(desk, tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(desk, tmp_path / "cycle", Interface(tmp_path, port=port)):
         wrong, seen = await asyncio.to_thread(fuzz, port, examples)
         assert (await asyncio.to_thread(answered, port, "GET", "/healthz", "", {}, b""))[0] == 200
     assert wrong == []
@@ -117,7 +117,7 @@ async def test_no_request_by_the_document_or_against_it_makes_a_500(tmp_path: Pa
 
 async def test_a_method_that_is_not_done_at_an_address_is_answered_with_those_that_are(tmp_path: Path):
     port = free_port()
-    async with serve_fake(FakeService(), tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(FakeService(), tmp_path / "cycle", Interface(tmp_path, port=port)):
         document = json.loads((await asyncio.to_thread(ask, port, "GET", "/openapi.json"))[2])
         for path, entry in document["paths"].items():
             status, headers, _ = await asyncio.to_thread(ask, port, "OPTIONS", path.replace("{run}", "1"))
@@ -129,7 +129,7 @@ async def test_what_fails_is_answered_with_a_sentence_published_as_an_event_and_
     port, desk = free_port(), Broken()
     events: list[str] = []
     desk.hub.subscribe(lambda item: events.append(getattr(item, "text", "")))
-    async with serve_fake(desk, tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(desk, tmp_path / "cycle", Interface(tmp_path, port=port)):
         for _ in range(3):
             status, text = await asyncio.to_thread(answered, port, "POST", "/api/v1/run/reset", "", {}, b"")
             assert (status, "ZeroDivisionError" in json.loads(text)["error"]) == (500, True)

@@ -111,7 +111,7 @@ STALE = Quality.STALE
         "never good",
     ],
 )
-def test_a_safety_sensor_must_be_there_good_and_fresh(readings: list[Reading], rule: str | None):
+def test_a_safety_sensor_must_exist_and_be_good_and_fresh(readings: list[Reading], rule: str | None):
     assert rule_of(require_fresh_reading(AIR, 15.0)(hub_of(*readings), to_ns(100))) == rule
 
 

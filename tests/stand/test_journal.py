@@ -29,7 +29,7 @@ from thermostand.stand.running.memory.entries import (
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, take_over
 
 ENTRIES = [
-    Begun(1, "night-1", "0f", {"recipe.yaml": "ab"}, 7),
+    Begun(1, "cycle-1", "0f", {"recipe.yaml": "ab"}, 7),
     StepChanged(2, "a1", "started"),
     Soaked(3, "a1", 60.0),
     Held(4, "operator", True),
@@ -112,7 +112,7 @@ def flipped(path: Path, number: int) -> bytes:
     return path.read_bytes()
 
 
-def test_a_damaged_line_is_reported_and_kept_aside_and_the_lines_after_it_count(tmp_path):
+def test_a_damaged_line_is_reported_and_kept_in_a_file_and_the_lines_after_it_count(tmp_path):
     path = new_journal(tmp_path, *ENTRIES)
     damaged = flipped(path, 3)
     path.write_bytes(damaged + lines_with(ENTRIES[3:4], len(damaged))[:-4])  # and a torn tail
@@ -148,7 +148,7 @@ def test_lines_of_another_place_or_journal_do_not_count(tmp_path):
     assert parse_lines(other).damaged == ()
 
 
-def test_a_second_damage_is_kept_aside_as_well(tmp_path):
+def test_a_second_damage_is_kept_in_a_file_as_well(tmp_path):
     path = new_journal(tmp_path, *ENTRIES)
     first = flipped(path, 3)
     asyncio.run(write(Journal.open(tmp_path)[0]))
@@ -171,7 +171,7 @@ def test_a_damaged_last_line_is_cut_off_but_not_lost(tmp_path):
     assert (tmp_path / "journal.jsonl.damaged").read_bytes() == damaged
 
 
-def test_a_torn_tail_is_cut_off_and_the_journal_goes_on_behind_the_last_whole_line(tmp_path):
+def test_a_partial_tail_is_cut_off_and_the_journal_goes_on_behind_the_last_whole_line(tmp_path):
     path = new_journal(tmp_path, *ENTRIES[:3])
     whole = path.read_bytes()
     path.write_bytes(whole + lines_with(ENTRIES[3:4], len(whole))[:-4])
@@ -221,8 +221,8 @@ async def test_entries_that_the_disk_refuses_are_written_with_the_next(tmp_path)
         await journal.write(ENTRIES[2])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    (told,) = reported
-    assert "No space left on" in told
+    (report,) = reported
+    assert "No space left on" in report
     assert (tmp_path / JOURNAL_NAME).stat().st_size == size_bytes
     await journal.write(ENTRIES[3])
     await journal.close()

@@ -19,7 +19,7 @@ EACH = [(name, command) for name, app in APPS.items() for command in get_command
 
 
 @pytest.mark.parametrize(("name", "command"), EACH)
-def test_each_command_of_the_list_is_there(name: str, command: str):
+def test_each_command_of_the_list_exists(name: str, command: str):
     shown = CliRunner().invoke(APPS[name], [command, "--help"], prog_name=name)
     assert shown.exit_code == 0
     assert f"Usage: {name} {command} " in shown.output

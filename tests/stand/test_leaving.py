@@ -27,7 +27,7 @@ from thermostand.stand.service.queue import append
 from thermostand.stand.service.queue_file import QueueEntry
 from thermostand.stand.service.queue_worker import RunNotes, drain
 
-INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
+INFO = SessionInfo("cycle-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", stop_frames_below_bytes=0, alert_below_fraction=0.0)
 
 
@@ -109,11 +109,11 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
     async def leave(hung: Callable[[], None]) -> None:
         hub, clock, stop = Hub(), WallClock(), Stop(has_signals=False)
         disk, own = DiskProcess(), DiskProcess()
-        recorder = Recorder(tmp_path / "night-1", INFO, {}, {}, hub, clock, settings=SETTINGS, disk=disk)
+        recorder = Recorder(tmp_path / "cycle-1", INFO, {}, {}, hub, clock, settings=SETTINGS, disk=disk)
         await recorder.begin(tuple)
         recording = asyncio.create_task(recorder.run())
         log, journal = Logbook(hub, clock, RunState(())), Journal.create(recorder.directory)
-        await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
+        await log.begin(journal, Begun(clock.now_ns(), "cycle-1", "0f", {}), disk=disk)
         queue, reported = DiskCalls(own, QUEUE_LINE, clock), []
         entry = QueueEntry(id=1, recipe="r", config="c", config_text="", recipe_text="", target_text="", added_ns=1)
         await queue.call(append, tmp_path, entry)

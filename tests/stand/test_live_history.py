@@ -177,8 +177,8 @@ def test_no_reading_at_all_and_a_century_are_answered():
 
 
 async def test_a_recorded_session_gives_its_curves_and_marks_again(tmp_path):
-    published = await record(tmp_path / "night", 12)
-    found = read_session_columns(tmp_path / "night", 1000)
+    published = await record(tmp_path / "cycle", 12)
+    found = read_session_columns(tmp_path / "cycle", 1000)
     airs = [item for item in published if isinstance(item, Batch) and item.device == "regulator"]
     assert np.nanmin(found.low["regulator.pv"]) == min(batch.readings[0].value for batch in airs)
     assert np.nanmax(found.high["regulator.pv"]) == max(batch.readings[0].value for batch in airs)
@@ -189,8 +189,8 @@ async def test_a_recorded_session_gives_its_curves_and_marks_again(tmp_path):
     assert all(mark.end_ns is not None for mark in found.marks if mark.level == "step")
 
 
-async def test_after_a_restart_the_week_is_there_again_and_what_cannot_be_read_is_reported(tmp_path):
-    await record(tmp_path / "night", 12, make_half_second)
+async def test_after_a_restart_the_week_is_shown_again_and_what_cannot_be_read_is_reported(tmp_path):
+    await record(tmp_path / "cycle", 12, make_half_second)
     (tmp_path / "broken" / "telemetry").mkdir(parents=True)
     (tmp_path / "broken" / "telemetry" / "0000.mcap").write_bytes(b"nothing")
     history, troubles = read_recorded_week(tmp_path, START_NS + 3600 * NS_PER_S)

@@ -54,7 +54,7 @@ async def test_every_line_is_of_the_format_and_no_measurement_is_invented():
     assert r'stand="a \"stand\"\nof \\ours"' in text
 
 
-async def test_the_dashboard_asks_for_metrics_that_there_are():
+async def test_the_dashboard_asks_for_existing_metrics():
     text = await page()
     dashboard = json.loads(Path(str(importlib.resources.files("thermostand.configs") / "grafana.json")).read_text())
     asked = {

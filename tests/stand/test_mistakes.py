@@ -1,4 +1,4 @@
-"""Mistakes that people make, each with what is said of it: what is wrong, where, what to type."""
+"""Mistakes that people make, each with what is reported of it: what is wrong, where, what to type."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,7 @@ STAND = find_packaged("", "laboratory").read_text(encoding="utf-8")
 RECIPE = find_packaged("recipes", "trial").read_text(encoding="utf-8")
 
 
-def said(call: Callable[[], object], error: type[StandError] = ConfigError) -> str:
+def read_error(call: Callable[[], object], error: type[StandError] = ConfigError) -> str:
     with pytest.raises(error) as refused:
         call()
     return str(refused.value)
@@ -39,41 +39,41 @@ def said(call: Callable[[], object], error: type[StandError] = ConfigError) -> s
 )  # fmt: skip
 def test_a_value_of_another_kind(old: str, new: str, sentence: str):
     assert STAND.count(old) == 1, old
-    said_so = said(lambda: parse_document(STAND.replace(old, new), StandConfig, "mine.yaml"))
-    assert said_so.startswith(f"mine.yaml: {sentence}")
-    assert said_so.count("mine.yaml") == 1  # one mistake, one sentence
+    message = read_error(lambda: parse_document(STAND.replace(old, new), StandConfig, "mine.yaml"))
+    assert message.startswith(f"mine.yaml: {sentence}")
+    assert message.count("mine.yaml") == 1  # one mistake, one sentence
 
 
 def test_files_that_were_exchanged(tmp_path: Path):
-    exchanged = said(lambda: parse_document(RECIPE, StandConfig, "mine.yaml"))
+    exchanged = read_error(lambda: parse_document(RECIPE, StandConfig, "mine.yaml"))
     assert exchanged.startswith("mine.yaml: is a recipe")
     assert exchanged.endswith("`stand run RECIPE --config STAND`")
-    assert said(lambda: parse_document(STAND, Recipe, "mine.yaml")).startswith("mine.yaml: is a stand")
-    said_so = said(lambda: find_packaged("", str(tmp_path)))
-    assert said_so.startswith(f"{tmp_path}: is a folder")
-    assert "installed: laboratory" in said_so
+    assert read_error(lambda: parse_document(STAND, Recipe, "mine.yaml")).startswith("mine.yaml: is a stand")
+    message = read_error(lambda: find_packaged("", str(tmp_path)))
+    assert message.startswith(f"{tmp_path}: is a folder")
+    assert "installed: laboratory" in message
 
 
 def test_a_text_that_is_not_in_utf8(tmp_path: Path):
     file = tmp_path / "mine.yaml"
     file.write_bytes(STAND.replace('operator: ""', 'operator: "Müller"').encode("latin-1"))
-    said_so = said(lambda: load_document(file, StandConfig))
-    assert said_so.startswith(f"{file}: cannot be read (line 5 ")
+    message = read_error(lambda: load_document(file, StandConfig))
+    assert message.startswith(f"{file}: cannot be read (line 5 ")
 
 
 @pytest.mark.parametrize("registers", ["waveshare-relay", "omron-e5cc"])
 def test_a_register_map_of_another_unit_for_thermometers(tmp_path: Path, registers: str):
     file = tmp_path / "mine.yaml"
     file.write_text(STAND.replace("registers: icpdas-m7015", f"registers: {registers}"))
-    said_so = said(lambda: load_order("trial", str(file)))
-    assert said_so.startswith(f"{file}: thermometer_module: register map ")
-    assert said_so.endswith("of no thermometer module")
+    message = read_error(lambda: load_order("trial", str(file)))
+    assert message.startswith(f"{file}: thermometer_module: register map ")
+    assert message.endswith("of no thermometer module")
 
 
 def test_what_is_no_session_and_no_model(tmp_path: Path):
-    assert said(lambda: Session.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
+    assert read_error(lambda: Session.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
     file = tmp_path / "file"
     file.write_text("x")
-    assert said(lambda: Session.open(file), SessionError).startswith(f"{file}: is a file")
-    assert said(lambda: Journal.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
-    assert said(lambda: load_model(tmp_path / "m.json"), SessionError) == f"{tmp_path / 'm.json'}: no such file"
+    assert read_error(lambda: Session.open(file), SessionError).startswith(f"{file}: is a file")
+    assert read_error(lambda: Journal.open(tmp_path / "x"), SessionError) == f"{tmp_path / 'x'}: no such folder"
+    assert read_error(lambda: load_model(tmp_path / "m.json"), SessionError) == f"{tmp_path / 'm.json'}: no such file"

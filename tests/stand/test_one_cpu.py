@@ -31,7 +31,7 @@ def test_what_is_started_inside_shares_the_cpu_and_afterwards_all_are_usable_aga
     assert os.sched_getaffinity(0) == usable
 
 
-def test_a_thread_that_was_there_before_and_one_that_stays_behind_follow():
+def test_an_earlier_thread_and_one_that_stays_behind_follow():
     usable = os.sched_getaffinity(0)
     with ThreadPoolExecutor(1) as before, ThreadPoolExecutor(1) as within:
         assert before.submit(os.sched_getaffinity, 0).result() == usable
@@ -49,10 +49,10 @@ def test_the_cpus_are_given_back_also_after_an_error():
     assert os.sched_getaffinity(0) == usable
 
 
-def hold(folder: Path, told: Connection) -> None:
+def hold(folder: Path, sender: Connection) -> None:
     run._CPU_FOLDER = str(folder / "cpu{}")  # type: ignore[reportPrivateUsage]  # others may take the machine's now
     with pin_to_one_cpu():
-        told.send(os.sched_getaffinity(0))
+        sender.send(os.sched_getaffinity(0))
         threading.Event().wait()
 
 
@@ -65,8 +65,8 @@ def test_runs_side_by_side_take_different_cpus_and_a_killed_one_gives_its_own_ba
         (tmp_path / f"cpu{cpu}").mkdir()
     fork = multiprocessing.get_context("fork")
     for _ in range(2):
-        heard, told = fork.Pipe(duplex=False)
-        runs = [fork.Process(target=hold, args=(tmp_path, told)) for _ in usable]
+        heard, sender = fork.Pipe(duplex=False)
+        runs = [fork.Process(target=hold, args=(tmp_path, sender)) for _ in usable]
         for each in runs:
             each.start()
         taken = set[int]().union(*(heard.recv() for _ in usable))

@@ -27,7 +27,7 @@ WHOLE_HEADER = """() => [...document.querySelectorAll("header .who, header .doin
     (part) => part.scrollWidth <= part.clientWidth && part.scrollHeight <= part.clientHeight + 1)"""
 
 
-# Values of five columns, of which the fourth has none; drift counts anew in the second.
+# Values of five columns, of which the fourth has none; drift counts again in the second.
 BY_REFERENCE = """async () => { const { table } = await import("/static/curves.js");
 const marks = [{ level: "reference", kind: "camera", time_ns: 1.5e9 },
   { level: "reference", kind: "other", time_ns: 0 }];
@@ -36,9 +36,9 @@ const drawn = table({ from_ns: 0, width_ns: 1e9, points: 5, low, high: {}, marks
 return drawn.map((value) => (value === undefined ? "undefined" : value)) }"""
 
 
-async def until_looked_at(night, role):
+async def until_looked_at(desk, role):
     async with asyncio.timeout(60):
-        while night.viewing.previews.get("camera") is None or night.viewing.previews["camera"].role != role:
+        while desk.viewing.previews.get("camera") is None or desk.viewing.previews["camera"].role != role:
             await asyncio.sleep(0.05)
 
 
@@ -51,8 +51,8 @@ async def picture(page):
     return await page.evaluate("() => document.querySelector('.curve canvas')?.toDataURL() ?? ''")
 
 
-async def test_the_page_shows_the_stand_and_its_curves_move(night):
-    async with a_page(night.chromium, night.port) as page:
+async def test_the_page_shows_the_stand_and_its_curves_move(desk):
+    async with a_page(desk.chromium, desk.port) as page:
         await page.get_by_text("Running", exact=True).wait_for()
         assert await page.locator("#stand").inner_text() == "cold-chamber"
         row = page.locator(".readings tr", has_text="air")
@@ -66,91 +66,91 @@ async def test_the_page_shows_the_stand_and_its_curves_move(night):
                 await asyncio.sleep(0.2)
         trend = row.locator("td").last
         await trend.get_by_text(re.compile(r"K|steady")).wait_for()
-        night.lost = "thermometers"
+        desk.lost = "thermometers"
         await row.locator(".value", has_text="no reading").wait_for()
         assert not await trend.inner_text()  # of what is not read nobody knows where it goes
 
 
-async def test_what_a_device_measures_in_a_unit_of_its_own_has_a_row_and_a_curve(night):
-    async with a_page(night.chromium, night.port) as page:
-        now_ns = night.clock.now_ns()
+async def test_what_a_device_measures_in_a_unit_of_its_own_has_a_row_and_a_curve(desk):
+    async with a_page(desk.chromium, desk.port) as page:
+        now_ns = desk.clock.now_ns()
         pressure = Reading("lab.pressure", 1013.2, "hPa", now_ns)
-        night.hub.publish(Batch("lab", now_ns, (pressure, Reading("lab.wet", 1.0, "1", now_ns))))
+        desk.hub.publish(Batch("lab", now_ns, (pressure, Reading("lab.wet", 1.0, "1", now_ns))))
         row = page.locator(".readings tr", has_text="lab pressure")
         await row.locator(".value", has_text="1013.20 hPa").wait_for()
         await page.locator(".curve[aria-label*='hPa'] canvas").wait_for()
         assert not await page.locator(".readings tr", has_text="lab wet").count()  # a flag has no curve
 
 
-async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_answer(night):
-    night.is_idle = True
-    async with a_page(night.chromium, night.port, size=PHONE) as page:
+async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_answer(desk):
+    desk.is_idle = True
+    async with a_page(desk.chromium, desk.port, size=PHONE) as page:
         await page.get_by_text("Idle", exact=True).wait_for()
-        night.by_hand = HeatByHand(setpoint_degC=40.0, since_ns=night.clock.now_ns())
-        for night.lost, said in (("", "°C"), ("regulator", "no reading"), ("", "°C")):
-            await page.locator(".readings tr", has_text="set-point").locator(".value", has_text=said).wait_for()
+        desk.by_hand = HeatByHand(setpoint_degC=40.0, since_ns=desk.clock.now_ns())
+        for desk.lost, shown in (("", "°C"), ("regulator", "no reading"), ("", "°C")):
+            await page.locator(".readings tr", has_text="set-point").locator(".value", has_text=shown).wait_for()
             await page.locator("#phase", has_text="Heat by hand").wait_for()
             await page.locator("#doing", has_text="set to 40 °C, on since ").wait_for()
             assert await page.evaluate(WHOLE_HEADER)
-        night.by_hand = None
+        desk.by_hand = None
         await page.get_by_text("Idle", exact=True).wait_for()
 
 
-async def test_a_held_run_whose_set_point_is_not_read_is_not_said_to_be_stopped(night):
-    night.gate.hold(CAMERA_LOST)
-    async with a_page(night.chromium, night.port) as page:
+async def test_a_held_run_whose_set_point_is_not_read_is_not_shown_as_stopped(desk):
+    desk.gate.hold(CAMERA_LOST)
+    async with a_page(desk.chromium, desk.port) as page:
         held = page.locator(".notice", has_text="The run is held: a camera does not answer")
         await held.get_by_text("The chamber keeps its set-point.").wait_for()
-        night.lost = "regulator"
+        desk.lost = "regulator"
         await held.get_by_text("Heat and cold are permitted; the regulator's set-point is not known now.").wait_for()
-        now_ns = night.clock.now_ns()
-        night.hub.publish(Batch("regulator", now_ns, (Reading("regulator.running", 0.0, "1", now_ns),)))
+        now_ns = desk.clock.now_ns()
+        desk.hub.publish(Batch("regulator", now_ns, (Reading("regulator.running", 0.0, "1", now_ns),)))
         await held.get_by_text("The regulator is stopped.").wait_for()
-        night.is_heat_permitted = False
+        desk.is_heat_permitted = False
         await held.get_by_text("Heat and cold are not permitted.").wait_for()
 
 
-async def test_what_is_not_confirmed_safe_is_seen_until_it_is(night):
+async def test_what_is_not_confirmed_safe_is_seen_until_it_is(desk):
     """Under a fault, which does not say that the stand is safe meanwhile."""
-    night.trip()
-    since_ns, failure = night.clock.now_ns(), "relays did not confirm its safe state: relays: no answer"
+    desk.trip()
+    since_ns, failure = desk.clock.now_ns(), "relays did not confirm its safe state: relays: no answer"
     waiting = NotConfirmed(name="relays", since_ns=since_ns, timer_s=15.0)
-    night.not_confirmed = (waiting, NotConfirmed(name="flap", since_ns=since_ns))
-    async with a_page(night.chromium, night.port, size=PHONE) as page:
+    desk.not_confirmed = (waiting, NotConfirmed(name="flap", since_ns=since_ns))
+    async with a_page(desk.chromium, desk.port, size=PHONE) as page:
         await page.get_by_role("heading", name="Being made safe: relays, flap", exact=True).wait_for()
         fault = page.locator(".notice", has_text="Tripped: ")
         await fault.get_by_text("That the stand is safe is not yet confirmed.").wait_for()
-        night.not_confirmed = (waiting.model_copy(update={"reason": failure}),)
+        desk.not_confirmed = (waiting.model_copy(update={"reason": failure}),)
         alert = page.locator(".notice.error", has_text="Not yet confirmed safe: relays")
         await alert.get_by_text(failure).wait_for()
         first = await page.locator("#notices .notice").first.inner_text()
         assert "at the latest 15 s" in first
-        night.not_confirmed = ()
+        desk.not_confirmed = ()
         await alert.wait_for(state="detached")
         await fault.get_by_text("The stand is made safe.").wait_for()
 
 
 @pytest.mark.usefixtures("compiled_fit")
-async def test_the_drift_of_two_references_is_no_one_line(night):
-    """Two series of reference frames, as of two runs: the page breaks its line where drift begins to count anew."""
-    history = night.viewing.history
-    async with a_page(night.chromium, night.port) as page:
+async def test_the_drift_of_two_references_is_no_one_line(desk):
+    """Two series of reference frames, as of two runs: the page breaks its line where drift begins to count again."""
+    history = desk.viewing.history
+    async with a_page(desk.chromium, desk.port) as page:
         for moved_px in (0.0, 0.3):
-            night.hub.publish(StepMark(0, "r", 0, "capture", StepState.STARTED, {"role": "reference"}))
-            night.hub.publish(frame_of(target_image(moved_px, 0), night.clock.now_ns(), "r"))
-            night.hub.publish(StepMark(0, "f", 0, "capture", StepState.STARTED, {"role": "fit"}))
-            await until_looked_at(night, "reference")
-            night.hub.publish(frame_of(target_image(moved_px + 0.5, 0), night.clock.now_ns(), "f"))
-            await until_looked_at(night, "fit")
-        now_ns = night.clock.now_ns()
+            desk.hub.publish(StepMark(0, "r", 0, "capture", StepState.STARTED, {"role": "reference"}))
+            desk.hub.publish(frame_of(target_image(moved_px, 0), desk.clock.now_ns(), "r"))
+            desk.hub.publish(StepMark(0, "f", 0, "capture", StepState.STARTED, {"role": "fit"}))
+            await until_looked_at(desk, "reference")
+            desk.hub.publish(frame_of(target_image(moved_px + 0.5, 0), desk.clock.now_ns(), "f"))
+            await until_looked_at(desk, "fit")
+        now_ns = desk.clock.now_ns()
         (mark,) = [each for each in history.columns(now_ns - NS_PER_S * 60, now_ns).marks if each.level == "reference"]
         assert mark.kind == "camera"
         broken = await page.evaluate(BY_REFERENCE)
         assert broken == [1, None, 3, "undefined", 5]
 
 
-async def test_event_marks_and_the_night_are_there_after_a_reload(night):
-    async with a_page(night.chromium, night.port) as page:
+async def test_event_marks_and_the_session_are_shown_after_a_reload(desk):
+    async with a_page(desk.chromium, desk.port) as page:
         await page.get_by_role("button", name="12 h").click()
         await page.get_by_text("thermometers does not answer").wait_for()
         await page.reload()
@@ -165,8 +165,8 @@ def asked_s(url: str) -> float:
     return (int(query["to_ns"][0]) - int(query["from_ns"][0])) / NS_PER_S if is_history else 0.0
 
 
-async def test_zooming_shows_a_part_of_the_night_and_the_way_back(night):
-    async with a_page(night.chromium, night.port) as page:
+async def test_zooming_shows_a_part_of_the_session_and_the_way_back(desk):
+    async with a_page(desk.chromium, desk.port) as page:
         await page.get_by_role("button", name="12 h").click()
         await page.get_by_text("thermometers does not answer").wait_for()
         over = await page.locator(".u-over").first.bounding_box()
@@ -182,11 +182,11 @@ async def test_zooming_shows_a_part_of_the_night_and_the_way_back(night):
 
 
 @pytest.mark.usefixtures("compiled_fit")
-async def test_markers_and_drift_of_the_last_frame_are_shown(night):
-    async with a_page(night.chromium, night.port, "camera") as page:
-        night.hub.publish(frame_of(target_image(0, 0), night.clock.now_ns()))
+async def test_markers_and_drift_of_the_last_frame_are_shown(desk):
+    async with a_page(desk.chromium, desk.port, "camera") as page:
+        desk.hub.publish(frame_of(target_image(0, 0), desk.clock.now_ns()))
         await page.get_by_text("54 of 54").wait_for()
-        night.hub.publish(frame_of(target_image(0.3, 0), night.clock.now_ns()))
+        desk.hub.publish(frame_of(target_image(0.3, 0), desk.clock.now_ns()))
         await page.get_by_text("worst marker").wait_for()
         async with asyncio.timeout(60):
             while "0.000 px" in await page.locator(".frame + .facts").inner_text():
@@ -204,7 +204,7 @@ def overlap_px(one, other):
     )
 
 
-async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
+async def test_two_sessions_are_shown_one_over_the_other(desk, tmp_path):
     for name, warm_degC in (("monday", 24.0), ("tuesday", 30.0)):
 
         def items(time_ns, index, warm_degC=warm_degC):
@@ -213,7 +213,7 @@ async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
             yield Batch("camera", time_ns, (Reading("camera.temperature", camera, "degC", time_ns),))
 
         await record(tmp_path / "sessions" / name, 40, items, segment_s=3600, period_ns=60 * NS_PER_S)
-    async with a_page(night.chromium, night.port, "sessions") as page:
+    async with a_page(desk.chromium, desk.port, "sessions") as page:
         for name in ("monday", "tuesday"):
             await page.get_by_label(f"Choose {name}").check()
         await page.get_by_role("button", name="Compare these two sessions").click()
@@ -224,7 +224,7 @@ async def test_two_nights_are_shown_one_over_the_other(night, tmp_path):
             await page.get_by_text(text).wait_for()
         await page.get_by_role("button", name="Close").click()
         await curves.wait_for(state="detached")
-    async with a_page(night.chromium, night.port, "sessions", PHONE) as page:
+    async with a_page(desk.chromium, desk.port, "sessions", PHONE) as page:
         row = page.locator(".sessions tr", has_text="monday")
         await row.get_by_text("2026", exact=False).wait_for()  # of which year, also in that year
         boxes = [box for cell in await row.locator("td").all() if (box := await cell.bounding_box())]
@@ -250,14 +250,14 @@ async def test_the_page_finds_the_stand_again_after_the_daemon_restarts(tmp_path
         await manager.__aexit__(None, None, None)
 
 
-async def test_a_phone_is_wide_enough_for_every_view(night):
-    async with a_page(night.chromium, night.port, size=PHONE, scheme="dark") as page:
+async def test_a_phone_is_wide_enough_for_every_view(desk):
+    async with a_page(desk.chromium, desk.port, size=PHONE, scheme="dark") as page:
         for view in VIEWS:
-            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
+            await page.goto(f"http://127.0.0.1:{desk.port}/#{view}")
             await page.wait_for_timeout(500)
             assert await page.evaluate("() => document.documentElement.scrollWidth <= innerWidth"), view
             assert await page.evaluate(WHOLE_HEADER), view
-        await page.goto(f"http://127.0.0.1:{night.port}/#now")
+        await page.goto(f"http://127.0.0.1:{desk.port}/#now")
         boxes = [await page.get_by_role("heading", name=name).bounding_box() for name in ("Readings", "Temperatures")]
         assert boxes[0]["y"] < boxes[1]["y"]
 
@@ -270,16 +270,16 @@ return { colour: all.filter((each) => each.tags.includes("cat.color")).map((each
     violations: found.violations.map((each) => [each.id, each.nodes.map((node) => node.html)]) } }"""
 
 
-async def test_every_view_is_accessible(night):
+async def test_every_view_is_accessible(desk):
     """axe finds nothing; a fault, a prompt and a pause are on the page. In the dark only its rules of colour are asked:
     nothing but colours is other there (test_the_dark_changes_colours_only)."""
-    night.trip()
-    night.ask_operator("Roll the camera by 20 degrees")
-    async with a_page(night.chromium, night.port) as page:
+    desk.trip()
+    desk.ask_operator("Roll the camera by 20 degrees")
+    async with a_page(desk.chromium, desk.port) as page:
         await page.get_by_role("button", name="Look at it and reset").click()
         await page.evaluate(AXE_SCRIPT)
         for view in VIEWS:
-            await page.goto(f"http://127.0.0.1:{night.port}/#{view}")
+            await page.goto(f"http://127.0.0.1:{desk.port}/#{view}")
             await page.wait_for_timeout(800)
             light = await page.evaluate(AXE)
             assert light["violations"] == [], view

@@ -93,11 +93,11 @@ class Bench:
             await self.permits.arm(*outputs)
             await self.wait(5.0)
 
-    def told(self) -> list[tuple[str, object]]:
+    def reported(self) -> list[tuple[str, object]]:
         """Kinds of events since the last call, and the relay of each."""
-        told = [(event.kind, event.data.get("relay", event.data.get("running"))) for event in self.events]
+        reported = [(event.kind, event.data.get("relay", event.data.get("running"))) for event in self.events]
         self.events.clear()
-        return told
+        return reported
 
 
 @asynccontextmanager
@@ -130,7 +130,7 @@ async def test_heat_lasts_as_long_as_it_is_renewed_and_its_timer_longer():
         await bench.wait(60.0)
         permits.revoke()
         assert permits.ended_ns is None  # heat was not to last
-        assert bench.told() == []
+        assert bench.reported() == []
 
 
 async def test_relays_without_a_timer_end_nothing():
@@ -153,9 +153,9 @@ async def test_while_the_guard_finds_something_nothing_is_renewed():
         assert bench.kept == []
 
 
-@pytest.mark.parametrize(("left_s", "told"), [(9.0, [("heater_enable_dropped", HEATER)]), (0.5, [])])
+@pytest.mark.parametrize(("left_s", "reported"), [(9.0, [("heater_enable_dropped", HEATER)]), (0.5, [])])
 async def test_a_relay_that_is_off_before_its_time_was_dropped_unless_its_time_is_all_but_over(
-    left_s: float, told: list[tuple[str, str]]
+    left_s: float, reported: list[tuple[str, str]]
 ):
     async with benches() as bench:
         bench.permits.grant()
@@ -166,18 +166,18 @@ async def test_a_relay_that_is_off_before_its_time_was_dropped_unless_its_time_i
         await bench.keep(30.0)
         assert not any("compressor" in event.text for event in bench.events)
         assert all(f"off {left_s:.1f} s before its time" in event.text for event in bench.events)
-        assert bench.told() == told
+        assert bench.reported() == reported
         assert bench.board.is_on(HEATER)
 
 
-async def test_a_relay_that_never_comes_on_is_said_as_such_each_time_also_after_it_was_on():
+async def test_a_relay_that_never_comes_on_is_reported_each_time_also_after_it_was_on():
     async with benches() as bench:
         bench.permits.grant()
         await bench.keep(10.0)
         bench.board.is_jammed = True
         bench.board.others_switch(HEATER, False)
         await bench.keep(15.0)
-        assert bench.told() == [("heater_enable_dropped", HEATER), *[("heater_enable_not_on", HEATER)] * 2]
+        assert bench.reported() == [("heater_enable_dropped", HEATER), *[("heater_enable_not_on", HEATER)] * 2]
 
 
 async def test_the_compressor_is_remembered_before_it_runs_and_when_it_has_stopped():
@@ -187,14 +187,14 @@ async def test_the_compressor_is_remembered_before_it_runs_and_when_it_has_stopp
         await bench.keep(200.0, COLD)
         assert bench.board.is_on(COMPRESSOR)
         assert bench.kept == [CompressorState(True, begun_ns, (begun_ns,))]
-        assert bench.told() == [("compressor", True)]
+        assert bench.reported() == [("compressor", True)]
         await bench.keep(5.0, WARM)
         ended_ns = bench.now_ns - to_ns(5.0)
         assert not bench.board.is_on(COMPRESSOR)
         assert bench.board.switched == [(COMPRESSOR, False)]
         assert bench.kept[1:] == [CompressorState(False, ended_ns, (begun_ns,))]
         await bench.keep(30.0)
-        assert bench.told() == [("compressor", False)]  # and nothing has dropped
+        assert bench.reported() == [("compressor", False)]  # and nothing has dropped
 
 
 async def test_a_start_that_is_not_confirmed_counts_and_a_relay_that_then_drops_is_a_stop():
@@ -215,7 +215,7 @@ async def test_a_start_that_is_not_confirmed_counts_and_a_relay_that_then_drops_
         await bench.wait(60.0)
         await bench.permits.arm(0.0, 0.0)
         assert bench.kept[1:] == [CompressorState(False, begun_ns + to_ns(HOLD_S), (begun_ns,))]
-        assert bench.told() == []
+        assert bench.reported() == []
 
 
 async def test_a_compressor_that_was_dropped_before_its_time_rests_from_then_on():
@@ -228,7 +228,7 @@ async def test_a_compressor_that_was_dropped_before_its_time_rests_from_then_on(
         await bench.keep(300.0, COLD)
         assert bench.kept[1:] == [CompressorState(False, dropped_ns, (begun_ns,))]
         assert "counts as a stop" in bench.events[1].text
-        assert bench.told() == [("compressor", True), ("compressor_dropped", COMPRESSOR)]
+        assert bench.reported() == [("compressor", True), ("compressor_dropped", COMPRESSOR)]
         await bench.keep(5.0, COLD)
         assert bench.board.is_on(COMPRESSOR)
 
@@ -243,7 +243,7 @@ async def test_what_others_switch_on_while_heat_is_permitted_is_off_again_and_co
         assert not bench.board.is_on(COMPRESSOR)
         assert bench.board.is_on(HEATER)
         assert bench.kept == [CompressorState(False, on_ns, (on_ns,))]
-        assert bench.told() == [("switched_off", COMPRESSOR)]
+        assert bench.reported() == [("switched_off", COMPRESSOR)]
         assert bench.permits.intrusions == 1
         bench.permits.clear_intrusions()
         assert bench.permits.intrusions == 0
@@ -263,13 +263,13 @@ async def test_without_permission_what_reads_on_is_switched_off_once_it_was_conf
         await permits.make_safe()
         assert permits.permission is Permission.WITHDRAWN
         await permits.supervise()
-        assert (board.switched, bench.told()) == ([], [])
+        assert (board.switched, bench.reported()) == ([], [])
         for channel in (HEATER, COMPRESSOR):
             board.others_switch(channel, True)
         on_ns = bench.now_ns
         assert await permits.supervise() == {HEATER: True, COMPRESSOR: True}
         assert board.switched == [(HEATER, False), (COMPRESSOR, False)]
-        assert bench.told() == [("switched_off", HEATER), ("switched_off", COMPRESSOR)]
+        assert bench.reported() == [("switched_off", HEATER), ("switched_off", COMPRESSOR)]
         assert bench.kept == [CompressorState(False, on_ns, (on_ns,))]
         assert permits.intrusions == 2
         permits.grant()
@@ -286,22 +286,22 @@ async def test_a_compressor_that_is_made_safe_has_stopped_and_its_relay_was_not_
         assert bench.kept[1:] == [stopped]
         bench.permits.grant()
         await bench.keep(20.0)
-        assert bench.told() == [("compressor", True)]
+        assert bench.reported() == [("compressor", True)]
         assert bench.kept[2:] == []
 
 
-async def test_what_was_left_on_is_said_relay_by_relay_and_a_compressor_rests_from_now_on():
+async def test_what_was_left_on_is_reported_relay_by_relay_and_a_compressor_rests_from_now_on():
     start_ns = to_ns(500)
     async with benches(CompressorState(False, 0, (start_ns,))) as bench:
         for channel in (HEATER, COMPRESSOR):
             bench.board.others_switch(channel, True)
         await bench.wait(10.0)
         await bench.permits.switch_off_left_on()
-        assert bench.told() == [("left_on", COMPRESSOR), ("left_on", HEATER)]
+        assert bench.reported() == [("left_on", COMPRESSOR), ("left_on", HEATER)]
         assert bench.kept == [CompressorState(False, bench.now_ns, (start_ns,))]
         assert bench.permits.permission is Permission.WITHDRAWN
         await bench.permits.switch_off_left_on()
-        assert (bench.told(), bench.kept[1:]) == ([], [])
+        assert (bench.reported(), bench.kept[1:]) == ([], [])
 
 
 @pytest.mark.parametrize("is_timed", [False, True])
@@ -324,7 +324,7 @@ async def test_a_board_that_drops_in_time_is_suited_and_its_time_is_measured_whe
 
 
 @pytest.mark.parametrize(("lasts", "rearmed", "dropped"), [(True, True, False), (False, False, True)])
-async def test_a_board_that_never_drops_or_does_not_begin_its_time_again_is_said_and_not_trusted(
+async def test_a_board_that_never_drops_or_does_not_begin_its_time_again_is_reported_and_not_trusted(
     lasts: bool, rearmed: bool, dropped: bool
 ):
     async with benches() as bench:
@@ -426,11 +426,11 @@ async def test_permits_are_renewed_each_5_s_and_looked_at_each_2_5_s_once_they_a
         await kept.run(6.0)
         assert [time_s for time_s, _ in kept.seen] == [1012.0, 1014.5, 1017.0]
         assert kept.regulator.reads == 3
-        assert kept.told() == []
+        assert kept.reported() == []
 
 
 @pytest.mark.parametrize("name", ["running", "mv_heat", "mv_cool"])
-async def test_a_regulator_that_runs_or_gives_something_without_permission_is_stopped_and_said(name: str):
+async def test_a_regulator_that_runs_or_heats_without_permission_is_stopped_and_reported(name: str):
     async with keepers() as kept:
         kept.regulator.values[name] = 1.0
         await kept.run(3.0)
@@ -459,7 +459,7 @@ async def test_a_regulator_that_was_permitted_to_run_while_it_was_asked_is_left_
         assert kept.permits.intrusions == 0
 
 
-async def test_what_keeps_permits_from_being_renewed_is_said_when_it_begins_and_when_it_is_another():
+async def test_what_keeps_permits_from_being_renewed_is_reported_when_it_begins_and_when_it_is_another():
     async with keepers() as kept:
         kept.permits.grant()
         failures: list[DeviceError | None] = [
@@ -470,10 +470,10 @@ async def test_what_keeps_permits_from_being_renewed_is_said_when_it_begins_and_
             GarbledReply("gateway", "noise"),
         ]
         keeping = asyncio.create_task(kept.keeper.run())
-        told: list[int] = []
+        reported: list[int] = []
         for failure in failures:
             kept.board.failure = failure
             await kept.wait(5.0)
-            told.append(len(kept.told()))
+            reported.append(len(kept.reported()))
         await cancel_all([keeping])
-        assert told == [1, 0, 0, 1, 0, 1, 0, 1]
+        assert reported == [1, 0, 0, 1, 0, 1, 0, 1]

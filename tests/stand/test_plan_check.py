@@ -1,4 +1,4 @@
-"""Steps that somebody wants to replace others by: what is wrong is said of each, and nothing is changed."""
+"""Steps that somebody wants to replace others by: what is wrong is reported of each, and nothing is changed."""
 
 import asyncio
 from pathlib import Path
@@ -59,7 +59,7 @@ def labelled(step: WrittenStep, **parameters: JsonValue) -> WrittenStep:
         (1, [written("stop_chamber"), written("soak_until_settled", **UNTIL, chamber_degC=24)], {2: "start_chamber"}),
     ],
 )
-def test_what_is_wrong_is_said_of_each_step(from_index, steps, faults):
+def test_what_is_wrong_is_reported_for_each_step(from_index, steps, faults):
     found = check_edit(BEGUN, from_index, steps, CONFIG)
     assert [fault.index for fault in found.faults] == list(faults)
     assert all(text in fault.text for fault, text in zip(found.faults, faults.values(), strict=True))

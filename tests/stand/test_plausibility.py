@@ -24,22 +24,22 @@ from thermostand.stand.guarding.stuck_sensor import forbid_stuck_while_other_mov
 from thermostand.stand.safety.fault import Fault
 
 
-def faults_of(night: ChamberRun) -> list[tuple[float, Fault]]:
-    """(s, fault) of everything the whole table says in a night, warnings too."""
+def faults_of(run: ChamberRun) -> list[tuple[float, Fault]]:
+    """(s, fault) of everything the whole table says in a session, warnings too."""
     config, announced = load_config(find_packaged("", "simulated")), Announcements()
     rules = make_watches(config, announced)
-    said: list[tuple[float, Fault]] = []
-    for now_ns in night.polls():
-        for fault in (watch.check(night.hub, now_ns) for watch in rules):
+    faults: list[tuple[float, Fault]] = []
+    for now_ns in run.polls():
+        for fault in (watch.check(run.hub, now_ns) for watch in rules):
             if fault is not None:
-                said.append(((now_ns - START_NS) / NS_PER_S, fault))
-        if said:
+                faults.append(((now_ns - START_NS) / NS_PER_S, fault))
+        if faults:
             break
-    return said
+    return faults
 
 
 @pytest.mark.parametrize(
-    "night",
+    "run",
     [
         mark_nightly(ChamberRun([24, 60, -10, 52, 10, 24], 3600)),
         ChamberRun([30, 24, 45, 10, 60, 20], 900),
@@ -48,9 +48,9 @@ def faults_of(night: ChamberRun) -> list[tuple[float, Fault]]:
         mark_nightly(ChamberRun([24, 55, 24, 40], 2700, compressor_always=True)),
         mark_nightly(ChamberRun([-10, 60, 0], 3600, laboratory_degC=32)),
         mark_nightly(ChamberRun([60, -10, 60], 3600, laboratory_degC=10)),
-        ChamberRun([10], 9000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None),
-        mark_nightly(ChamberRun([10], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
-        mark_nightly(ChamberRun([52], 18_000, disturb=lambda night, time_s: night.stop() if time_s == 5400 else None)),
+        ChamberRun([10], 9000, disturb=lambda run, time_s: run.stop() if time_s == 5400 else None),
+        mark_nightly(ChamberRun([10], 18_000, disturb=lambda run, time_s: run.stop() if time_s == 5400 else None)),
+        mark_nightly(ChamberRun([52], 18_000, disturb=lambda run, time_s: run.stop() if time_s == 5400 else None)),
     ],
     ids=[
         "far",
@@ -65,13 +65,13 @@ def faults_of(night: ChamberRun) -> list[tuple[float, Fault]]:
         "cooling down",
     ],
 )
-def test_a_good_night_trips_nothing_and_warns_of_nothing(night: ChamberRun):
-    assert faults_of(night) == []
+def test_a_good_session_trips_nothing_and_warns_of_nothing(run: ChamberRun):
+    assert faults_of(run) == []
 
 
 def dead_heater(from_s: float) -> Callable[[ChamberRun, float], None]:
-    def disturb(night: ChamberRun, time_s: float) -> None:
-        night.plant.cut_out_open = time_s >= from_s
+    def disturb(run: ChamberRun, time_s: float) -> None:
+        run.plant.cut_out_open = time_s >= from_s
 
     return disturb
 
@@ -80,12 +80,12 @@ def welded(share: float) -> Callable[[float], Callable[[ChamberRun, float], None
     """The solid-state relay conducts for that share, whatever the regulator says."""
 
     def from_(from_s: float) -> Callable[[ChamberRun, float], None]:
-        def disturb(night: ChamberRun, time_s: float) -> None:
+        def disturb(run: ChamberRun, time_s: float) -> None:
             def conduct(time_ns: int, dt_s: float) -> None:
-                night.plant.heater_on_fraction = max(share, night.plant.heater_on_fraction)
+                run.plant.heater_on_fraction = max(share, run.plant.heater_on_fraction)
 
             if time_s == from_s:
-                night.plant.on_step.append(conduct)
+                run.plant.on_step.append(conduct)
 
         return disturb
 
@@ -94,8 +94,8 @@ def welded(share: float) -> Callable[[float], Callable[[ChamberRun, float], None
 
 def stuck_probe(pv_degC: float) -> Callable[[float], Callable[[ChamberRun, float], None]]:
     def from_(from_s: float) -> Callable[[ChamberRun, float], None]:
-        def disturb(night: ChamberRun, time_s: float) -> None:
-            night.regulator.stuck_pv_degC = pv_degC if time_s >= from_s else None
+        def disturb(run: ChamberRun, time_s: float) -> None:
+            run.regulator.stuck_pv_degC = pv_degC if time_s >= from_s else None
 
         return disturb
 
@@ -103,16 +103,16 @@ def stuck_probe(pv_degC: float) -> Callable[[float], Callable[[ChamberRun, float
 
 
 def lost_permit(from_s: float) -> Callable[[ChamberRun, float], None]:
-    def disturb(night: ChamberRun, time_s: float) -> None:
-        night.permitted = time_s < from_s
+    def disturb(run: ChamberRun, time_s: float) -> None:
+        run.permitted = time_s < from_s
 
     return disturb
 
 
 def drifting_probe(K_per_h: float) -> Callable[[float], Callable[[ChamberRun, float], None]]:
     def from_(from_s: float) -> Callable[[ChamberRun, float], None]:
-        def disturb(night: ChamberRun, time_s: float) -> None:
-            night.regulator.pv_offset_K = max(0.0, time_s - from_s) * K_per_h / 3600
+        def disturb(run: ChamberRun, time_s: float) -> None:
+            run.regulator.pv_offset_K = max(0.0, time_s - from_s) * K_per_h / 3600
 
         return disturb
 
@@ -183,7 +183,7 @@ def publish(hub: Hub, channel: str, value: float) -> None:
 def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_change_is(
     air_K: Callable[[int], float], found_s: int | None
 ):
-    hub, rule, said_s = Hub(), forbid_stuck_while_other_moves(PV, AIR), list[int]()
+    hub, rule, times_s = Hub(), forbid_stuck_while_other_moves(PV, AIR), list[int]()
     publish(hub, PV, 24.0)
     for second in range(0, 4600, 5):
         now_ns, after_s = to_ns(second), second - 4000
@@ -191,8 +191,8 @@ def test_a_regulator_that_holds_its_temperature_is_not_stuck_one_that_misses_a_c
         hub.publish(Batch("device", now_ns, (Reading(AIR, air_degC, "degC", now_ns),)))
         if (fault := rule(hub, now_ns)) is not None:
             assert fault.rule == "sensor_stuck"
-            said_s.append(after_s)
-    assert said_s[:1] == ([] if found_s is None else [found_s])
+            times_s.append(after_s)
+    assert times_s[:1] == ([] if found_s is None else [found_s])
     publish(hub, PV, 24.1)
     assert rule(hub, to_ns(4601)) is None
 

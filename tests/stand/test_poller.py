@@ -56,7 +56,7 @@ async def test_a_device_that_is_slower_than_its_period_is_an_event_once_and_when
 
 
 @pytest.mark.parametrize(("kind", "over"), [("device_slow", "device_fast"), ("device_lost", "device_back")])
-async def test_a_device_that_comes_and_goes_is_told_three_times_and_its_end_once_that_lasts(kind: str, over: str):
+async def test_a_device_that_comes_and_goes_is_reported_three_times_and_its_end_once_that_lasts(kind: str, over: str):
     clock, hub, events = Hands(), Hub(RepeatLimit()), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     device = Slow(clock)

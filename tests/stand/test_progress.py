@@ -39,8 +39,8 @@ def test_a_salvage_and_a_verification_say_how_far_they_are(tmp_path: Path, monke
     write_segment(tmp_path / "s" / TELEMETRY, TELEMETRY, range(3), finish=True)
     write_segment(tmp_path / "s" / FRAMES, FRAMES, range(3))
     for command in ("repair", "verify"):
-        said = CliRunner().invoke(app, [command, str(tmp_path / "s")]).stderr
-        assert re.search(rf"^{command}: +\d+%  0:00:\d\d left  ", said), said
+        output = CliRunner().invoke(app, [command, str(tmp_path / "s")]).stderr
+        assert re.search(rf"^{command}: +\d+%  0:00:\d\d left  ", output), output
 
 
 def test_a_search_for_sound_bytes_in_a_damaged_place_is_reported_as_it_goes(tmp_path: Path):

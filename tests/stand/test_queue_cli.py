@@ -24,7 +24,7 @@ async def invoke(out: Path, *arguments: object) -> Result:
 
 
 async def test_runs_are_added_listed_moved_and_removed(tmp_path: Path):
-    recipe = tmp_path / "night.yaml"
+    recipe = tmp_path / "cycle.yaml"
     recipe.write_text("name: night\n")
     async with serve_fake(FakeService(), tmp_path) as desk:
         assert (await invoke(tmp_path, "add", "demo")).stdout == "1\n"

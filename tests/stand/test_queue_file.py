@@ -81,8 +81,8 @@ class QueueAgainstAList(RuleBasedStateMachine):
     @rule(data=st.data())
     def remove(self, data: st.DataObject) -> None:
         number = self.anyone(data)
-        there = {*self.open, *(other for other, _ in self.ended)}
-        if number in there:
+        known = {*self.open, *(other for other, _ in self.ended)}
+        if number in known:
             queue.remove(self.directory, number)
             self.open = [other for other in self.open if other != number]
             self.ended = [entry for entry in self.ended if entry[0] != number]
@@ -158,7 +158,7 @@ def test_what_is_queued_is_what_the_files_were_when_they_were_added(tmp_path: Pa
         ("name: bad\nexperiments: [{thermal_cycle: {set_points_degC: [65]}}]\n", r"outside limits\.chamber_degC"),
     ],
 )
-def test_a_typo_is_reported_when_a_recipe_is_added_not_at_night(tmp_path: Path, text: str, sentence: str):
+def test_a_typo_is_reported_when_a_recipe_is_added_not_when_it_runs(tmp_path: Path, text: str, sentence: str):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(text)
     with pytest.raises(ConfigError, match=sentence):
@@ -184,14 +184,14 @@ def test_an_interrupted_run_keeps_its_session_and_comes_first(tmp_path: Path):
     add(tmp_path)
     with lock_worker(tmp_path):
         queue.take(tmp_path, 5)
-        queue.note_session(tmp_path, 1, tmp_path / "night")
+        queue.note_session(tmp_path, 1, tmp_path / "cycle")
     interrupted, _ = queue.load_queue(tmp_path).entries
-    assert (interrupted.state, interrupted.session, interrupted.began_ns) == ("interrupted", "night", 5)
+    assert (interrupted.state, interrupted.session, interrupted.began_ns) == ("interrupted", "cycle", 5)
     assert interrupted.reason == "its daemon was killed"
     with lock_worker(tmp_path):
         again = queue.take(tmp_path, 9)
         assert again is not None
-        assert (again.id, again.session) == (1, "night")
+        assert (again.id, again.session) == (1, "cycle")
         running = queue.load_queue(tmp_path).entries[0]
         assert (running.state, running.began_ns, running.reason) == ("running", 5, "")
         with pytest.raises(SessionError, match="run 1 is running; one"):
@@ -239,7 +239,7 @@ def test_only_one_works_a_queue(tmp_path: Path):
 
 
 @pytest.mark.parametrize("number", [2, -1])
-def test_a_number_that_is_not_there_is_said_to(tmp_path: Path, number: int):
+def test_a_missing_number_is_reported(tmp_path: Path, number: int):
     add(tmp_path)
     with pytest.raises(SessionError, match=f"no run {number} in the queue"):
         queue.remove(tmp_path, number)
@@ -341,7 +341,7 @@ def test_a_disk_that_refuses_leaves_the_queue_as_it_was(tmp_path: Path):
     assert states(tmp_path) == [(1, "waiting"), (2, "waiting")]
 
 
-def test_looking_at_a_folder_without_a_queue_leaves_nothing_there(tmp_path: Path):
+def test_looking_at_a_folder_without_a_queue_leaves_nothing_in_it(tmp_path: Path):
     assert states(tmp_path) == []
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(SessionError, match="no such folder"):

@@ -149,13 +149,13 @@ async def test_a_queue_that_cannot_be_noted_in_does_not_end_a_run(tmp_path: Path
     async def run(entry: QueueEntry, notes: RunNotes) -> Path:
         good = (tmp_path / "queue.json").read_bytes()
         (tmp_path / "queue.json").write_bytes(b"")
-        await notes.begun(tmp_path / "night")
+        await notes.begun(tmp_path / "cycle")
         (tmp_path / "queue.json").write_bytes(good)
-        return tmp_path / "night"
+        return tmp_path / "cycle"
 
     await work(tmp_path, run, FollowedClock(7), runs.lines.append)
     assert any("cannot be noted" in line for line in runs.lines)
-    assert runs.entries() == [("done", "night", "")]
+    assert runs.entries() == [("done", "cycle", "")]
 
 
 async def test_a_queue_that_cannot_be_reached_keeps_nobody_from_leaving(
@@ -189,18 +189,18 @@ def worker_killed(directory: Path, steps_done: int) -> None:
     assert fork_server.run(command, timeout=60).returncode == -signal.SIGKILL
 
 
-async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_set_aside(tmp_path: Path):
+async def test_a_run_whose_daemon_dies_three_times_before_another_step_is_given_up(tmp_path: Path):
     runs = Runs(tmp_path, None)
     queue.append(tmp_path, queue.make_entry(ORDER, "simulated", 1))
     for steps_done in (0, 0, 2, 0, 0, 0):  # what the third has done begins the count again
         worker_killed(tmp_path, steps_done)
-        assert runs.entries()[0] == ("interrupted", "night", "its daemon was killed")
+        assert runs.entries()[0] == ("interrupted", "cycle", "its daemon was killed")
     await runs.work()
     assert runs.seen == [(2, "")]
     failed, done = runs.entries()
-    assert failed[:2] == ("failed", "night")
+    assert failed[:2] == ("failed", "cycle")
     assert "killed 3 times" in failed[2]
-    assert f"`stand resume {tmp_path / 'night'}`" in failed[2]
+    assert f"`stand resume {tmp_path / 'cycle'}`" in failed[2]
     assert done == ("done", "session-2", "")
     assert runs.lines[0] == f"run 1 (warm-up) failed: {failed[2]}"
 

@@ -35,7 +35,7 @@ from thermostand.stand.running.resume import Interruption, merge_recorded
 from thermostand.stand.safety.fault import Fault
 from thermostand.stand.safety.gate import INTERLOCK, OPERATOR, STOPPING
 
-BEGUN = Begun(1, "night-1", "0f", {})
+BEGUN = Begun(1, "cycle-1", "0f", {})
 
 
 def mark(time_ns: int, step_id: str, state: StepState) -> StepMark:
@@ -97,7 +97,7 @@ def test_a_run_that_is_not_resumed_after_all_is_left_to_others(tmp_path: Path):
     Journal.open(tmp_path)[0].release()
 
 
-async def test_what_holds_a_run_is_said_journaled_and_folded_but_for_its_end(tmp_path: Path):
+async def test_what_holds_a_run_is_reported_journaled_and_folded_but_for_its_end(tmp_path: Path):
     hub, clock, events = Hub(), VirtualClock(5), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     logbook, journal = Logbook(hub, clock, fold(PLAN, [])), Journal.create(tmp_path)

@@ -44,7 +44,7 @@ async def test_a_file_whose_values_depend_on_registers_of_the_camera_is_played(t
     assert reported.features["trigger"] == "FrameStart Software"
 
 
-async def test_what_the_rehearsal_cannot_play_is_not_said_of_the_camera(tmp_path: Path):
+async def test_what_the_rehearsal_cannot_play_is_not_reported_of_the_camera(tmp_path: Path):
     """A formula that no value of its register gives a time; a trigger whose register it does not find."""
     require_aravis()
     file, text = tmp_path / "camera.xml", DIALECTS["ticks of a clock"].xml("base").decode()
@@ -57,7 +57,7 @@ async def test_what_the_rehearsal_cannot_play_is_not_said_of_the_camera(tmp_path
     assert (reported.unplayed, reported.is_played) == (("TriggerSoftware",), False)
 
 
-async def test_an_entry_that_no_register_offers_is_not_said_of_the_camera(tmp_path: Path):
+async def test_an_entry_that_no_register_offers_is_not_taken_for_the_cameras(tmp_path: Path):
     require_aravis()
     file, text = tmp_path / "camera.xml", DIALECTS["abs"].xml("never").decode()
     never = (
@@ -99,7 +99,7 @@ ITSELF = '<Integer Name="Width"><pValue>A</pValue></Integer><Integer Name="A"><p
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "sentence"),
     [
         ("<?xml", "<html/><?xml", "is no GenICam file"),
         ("utf-8", "nobodys", "is no GenICam file: unknown encoding"),
@@ -108,11 +108,11 @@ ITSELF = '<Integer Name="Width"><pValue>A</pValue></Integer><Integer Name="A"><p
         ("<CommandValue>1<", "<CommandValue>one<", "has the CommandValue 'one', no whole number"),
     ],
 )
-async def test_what_is_no_cameras_genicam_file_is_refused(tmp_path: Path, old: str, new: str, said: str):
+async def test_what_is_no_cameras_genicam_file_is_refused(tmp_path: Path, old: str, new: str, sentence: str):
     require_aravis()
     file, text = tmp_path / "other.xml", DIALECTS["abs"].xml("other").decode()
     file.write_text(text.replace(old, new))
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=sentence):
         await rehearse(file)
 
 

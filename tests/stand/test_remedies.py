@@ -49,14 +49,14 @@ def published(*events: Event) -> list[Event]:
 
 def test_a_kind_that_is_added_is_found_everywhere(lamp: EventKind):
     (seen,) = published(lamp.at(5 * NS_PER_S, "no current", lamp="lamp 2", lit_s=720.0))
-    said = "lamp 2 has gone out after 12 min: no current"
-    assert seen == Event(5 * NS_PER_S, "warning", "lamp.broken", said, {"lamp": "lamp 2", "lit_s": 720.0})
+    sentence = "lamp 2 has gone out after 12 min: no current"
+    assert seen == Event(5 * NS_PER_S, "warning", "lamp.broken", sentence, {"lamp": "lamp 2", "lit_s": 720.0})
     assert get_next_command(seen.kind, seen.data, "/a night") == "exchange '/a night''s lamp"
     line = format_event({**vars_of(seen), "utc_offset_ns": 0}, "/n")
-    assert line == f"warning: 1970-01-01 00:00:05 UTC  {said}; exchange /n's lamp"
+    assert line == f"warning: 1970-01-01 00:00:05 UTC  {sentence}; exchange /n's lamp"
     book = AlertTracker("lab", ("device_lost",), 60 * NS_PER_S, 20)
     assert book.receive(seen, seen.time_ns) == []
-    assert [each.text for each in book.due(65 * NS_PER_S)] == [said]
+    assert [each.text for each in book.due(65 * NS_PER_S)] == [sentence]
     assert len(published(*[lamp.at(second, lamp="1", lit_s=1.0) for second in range(50)])) == 50
     row = next(line for line in make_troubleshooting_page().splitlines() if "`lamp.broken`" in line)
     assert [cell.strip() for cell in row.strip("|").split(" | ")[1:]] == [
@@ -88,9 +88,9 @@ def test_a_rule_of_the_guard_that_is_added_has_its_row():
     "data", [{}, {"lamp": "left"}, {"lamp": "left", "lit_s": "long"}, {"lamp": "left", "lit_s": None}]
 )
 def test_a_text_that_cannot_be_made_loses_no_event(lamp: EventKind, data: dict[str, object]):
-    told = lamp.at(7, "the fuse", **data)
-    assert (told.time_ns, told.level, told.kind, told.data) == (7, "warning", "lamp.broken", data)
-    assert told.text == ", ".join(["the fuse", *(f"{name} {value}" for name, value in data.items())])
+    reported = lamp.at(7, "the fuse", **data)
+    assert (reported.time_ns, reported.level, reported.kind, reported.data) == (7, "warning", "lamp.broken", data)
+    assert reported.text == ", ".join(["the fuse", *(f"{name} {value}" for name, value in data.items())])
 
 
 def test_a_name_is_taken_once():
@@ -118,11 +118,11 @@ def test_each_rule_that_trips_has_a_row():
     assert [ast.unparse(each) for each in named if isinstance(each, ast.Constant)] == []
 
 
-ROOMS = ("stand", "recording", "drivers/devices", "drivers/settings.py", "foundation", "experiments", "compensation")
+FOLDERS = ("stand", "recording", "drivers/devices", "drivers/settings.py", "foundation", "experiments", "compensation")
 TREES = {
     path: ast.parse(text)
-    for room in ROOMS
-    for path in ([ROOT / room] if room.endswith(".py") else sorted((ROOT / room).rglob("*.py")))
+    for folder in FOLDERS
+    for path in ([ROOT / folder] if folder.endswith(".py") else sorted((ROOT / folder).rglob("*.py")))
     if "thermostand.foundation.events" in (text := path.read_text("utf-8")) or "Event(" in text
 }
 NAMED = {name: row for name, row in vars(events).items() if isinstance(row, EventKind)} | {

@@ -45,7 +45,7 @@ def test_what_is_always_published_is_beyond_six_an_hour_an_information_unless_so
 
 
 @pytest.mark.parametrize("every_s", [2.0, 700.0, 1500.0])
-def test_a_state_that_comes_and_goes_is_told_six_times_an_hour_at_most_of_each_device(every_s: float):
+def test_a_state_that_comes_and_goes_is_reported_six_times_an_hour_at_most_of_each_device(every_s: float):
     hub, events = Hub(RepeatLimit()), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     for number in range(int(30000 / every_s)):
@@ -65,7 +65,7 @@ def test_a_sensor_that_flickers_is_not_believed_again_without_end():
     hub, events = Hub(RepeatLimit()), list[Event]()
     hub.subscribe(lambda item: events.append(item) if isinstance(item, Event) else None)
     for second in range(3600):
-        data = {"channels": ["thermometers.air"], "value_degC": 0.1 * second, "doubted_s": 1.0}
+        data = {"channels": ["thermometers.air"], "value_degC": 0.1 * second, "suspect_s": 1.0}
         hub.publish(SENSOR_BELIEVED.at(to_ns(second), "outside", **data))
     assert len(events) == 5
     assert events[-1].data["repeated"] == 1199

@@ -37,19 +37,19 @@ class Stand:
     desk: FakeService
     port: int
     file: Path
-    told: list[Event]
+    events: list[Event]
 
     def write(self, **kinds: dict[str, str]) -> None:
         write_tokens(self.file, TokenFile(**kinds))
 
     async def reload(self) -> Event:
-        """SIGHUP; what was said of it."""
-        before = len(self.told)
+        """SIGHUP; what was reported of it."""
+        before = len(self.events)
         os.kill(os.getpid(), signal.SIGHUP)
         async with asyncio.timeout(20):
-            while len(self.told) == before:
+            while len(self.events) == before:
                 await asyncio.sleep(0.005)
-        return self.told[-1]
+        return self.events[-1]
 
     async def ask(self, method: str, path: str, token: str = "", body: object = None, cookie: str = "") -> int:
         """The status."""
@@ -76,13 +76,13 @@ class Stand:
 
 @asynccontextmanager
 async def tokened(folder: Path) -> AsyncGenerator[Stand]:
-    file, told, port = folder / "tokens.yaml", list[Event](), find_free_port()
+    file, events, port = folder / "tokens.yaml", list[Event](), find_free_port()
     write_tokens(file, TokenFile(tokens={"rose": TOKEN}, read_only={"wall": LOOKS}))
     book, desk = TokenStore(load_tokens(file)), FakeService()
     before = signal.getsignal(signal.SIGHUP)
-    async with serve_fake(desk, folder / "night", Interface(folder, port=port, tokens=book)):
-        TokenReloader(file, book, desk.clock.now_ns, told.append).begin()
-        yield Stand(desk, port, file, told)
+    async with serve_fake(desk, folder / "cycle", Interface(folder, port=port, tokens=book)):
+        TokenReloader(file, book, desk.clock.now_ns, events.append).begin()
+        yield Stand(desk, port, file, events)
         asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
     signal.signal(signal.SIGHUP, before)
 
@@ -94,7 +94,7 @@ async def leaves(viewer: ClientConnection) -> tuple[int | None, str | None]:
 
 
 async def stays(viewer: ClientConnection, desk: FakeService) -> bool:
-    """It is told what happens from now on."""
+    """It is reported what happens from now on."""
     desk.tell("a sign")
     async with asyncio.timeout(20):
         while "a sign" not in await viewer.recv():
@@ -106,8 +106,8 @@ async def test_a_token_that_may_only_look_says_so_stops_and_is_refused_by_its_na
     async with tokened(tmp_path) as stand:
         _, _, known = await stand.answered("GET", "/api/v1/who", LOOKS)
         assert json.loads(known) == {"name": "wall", "how": "token", "read_only": True}
-        status, _, said = await stand.answered("POST", PAUSE, LOOKS)
-        assert (status, "the token of wall" in json.loads(said)["error"]) == (403, True)
+        status, _, answer = await stand.answered("POST", PAUSE, LOOKS)
+        assert (status, "the token of wall" in json.loads(answer)["error"]) == (403, True)
         assert await stand.ask("POST", STOP_PATH, LOOKS) == 200
         assert await stand.ask("POST", STOP_PATH) == 200
         for cookie in (await stand.logged_in(LOOKS), await stand.logged_in(TOKEN, {"read_only": True})):
@@ -127,7 +127,7 @@ async def test_what_is_taken_back_ends_at_sighup_and_nothing_else_does(tmp_path:
             await rose.recv()
             await wall.recv()
             stand.write(tokens={"rose": OTHER}, read_only={"wall": LOOKS})
-            assert await stand.ask("POST", PAUSE, TOKEN) == 200  # it has not been told yet
+            assert await stand.ask("POST", PAUSE, TOKEN) == 200  # it has not been reported yet
             assert (await stand.reload()).data == {"added": ["rose"], "revoked": ["rose"]}
             assert (await leaves(rose))[0] == 1008
             assert await stays(wall, stand.desk)
@@ -162,8 +162,8 @@ async def test_a_file_that_cannot_be_used_leaves_the_tokens_as_they_were(tmp_pat
         spoil(stand.file)
         async with stand.viewer(TOKEN) as rose:
             await rose.recv()
-            said = await stand.reload()
-            assert (said.kind, said.level, TOKEN in said.text) == ("tokens_not_read", "warning", False)
+            answer = await stand.reload()
+            assert (answer.kind, answer.level, TOKEN in answer.text) == ("tokens_not_read", "warning", False)
             assert await stays(rose, stand.desk)
         assert await stand.ask("POST", PAUSE, TOKEN) == 200
 
@@ -173,7 +173,7 @@ async def test_this_machine_may_be_trusted_to_look_only_by_secop_too(tmp_path: P
     desk, port, secop = SecopService(), find_free_port(), find_free_port()
     doors = (make_secop_listener(secop, read_only=True),)
     interface = Interface(tmp_path, port=port, tokens=tokens, trusts_loopback="read-only", doors=doors)
-    async with serve_fake(desk, tmp_path / "night", interface), talking(secop) as talk:
+    async with serve_fake(desk, tmp_path / "cycle", interface), talking(secop) as talk:
         statuses = [(await asyncio.to_thread(ask, port, *asked))[0] for asked in (("GET", "/metrics"), ("POST", PAUSE))]
         assert statuses == [200, 403]
         described = (await talk.asked("describe"))[2]["modules"]

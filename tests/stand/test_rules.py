@@ -1,4 +1,5 @@
-"""The guard's table with the installed limits: what is said on the hub, who is excused, what costs how much time."""
+"""The guard's table with the installed limits: what is reported on the hub, who is excused, what costs how much
+time."""
 
 import math
 from pathlib import Path
@@ -110,7 +111,7 @@ def test_a_capture_that_has_ended_excuses_nothing(end: StepState):
     assert found[0] == 300
 
 
-def test_a_disk_without_room_for_frames_holds_after_a_quarter_of_an_hour(tmp_path: Path):
+def test_a_disk_without_space_for_frames_holds_after_a_quarter_of_an_hour(tmp_path: Path):
     """What the recorder's own watch says, at a limit that no disk keeps."""
     notices: list[Event] = []
     SpaceWatch(tmp_path, 10**18, 0.0, lambda: 0, notices.append).check()
@@ -134,7 +135,7 @@ def test_what_no_probe_and_no_camera_can_be_is_no_measurement():
         assert highest < high < 200.0
 
 
-def test_before_anything_is_said_and_after_a_run_no_capture_is_under_way_and_frames_are_taken():
+def test_before_any_event_and_after_a_run_no_capture_is_under_way_and_frames_are_taken():
     announced = Announcements()
     assert (announced.is_capturing, announced.frames_stopped, announced.is_paused) == (False, "", False)
     announced.receive(mark("capture", StepState.STARTED))

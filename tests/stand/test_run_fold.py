@@ -123,7 +123,7 @@ def test_what_is_not_written_is_proved_by_the_recording_or_void_after_a_gap(entr
 
 @given(runs())
 def test_the_lines_of_a_journal_make_the_same_state(entries):
-    written = [Begun(0, "night-1", "0f", {}), *(entry for entry in entries if isinstance(entry, JournalEntry))]
+    written = [Begun(0, "cycle-1", "0f", {}), *(entry for entry in entries if isinstance(entry, JournalEntry))]
     assert fold(PLAN, read_lines(lines_with(written))[0]) == fold(PLAN, written)
 
 

@@ -303,7 +303,7 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
 
 
 def test_a_capture_is_taken_again_three_times_for_lost_frames_also_when_it_is_resumed_meanwhile():
-    """A disk that loses frames each time does not hold the night for good."""
+    """A disk that loses frames each time does not hold the session for good."""
     around = Surroundings(30 * S, flap_open=True, frames_lost=1)
     again = [Again(30 * S, [CAPTURE], 1), StepChanged(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
     entries = [*STATES["all frames"], *again, *again, Gap(32 * S, 33 * S), Restored(34 * S, 1)]
@@ -333,8 +333,8 @@ def test_a_frame_is_settled_when_it_is_the_first_after_a_soak_and_no_warm_up():
 def test_soaks_are_credited_only_in_the_band_and_when_the_camera_was_on():
     state, set_up = fold(PLAN, STATES["half soaked"]), SetUp(30.0, (PLAN[3],))
     for pv_degC, lost in ((29.1, ()), (31.0, ()), (28.9, (PLAN[3],))):
-        worth = credit_soaks(state, set_up, Surroundings(0, pv_degC=pv_degC))
-        assert (bool(worth.text), worth.lost) == (True, lost)
+        credit = credit_soaks(state, set_up, Surroundings(0, pv_degC=pv_degC))
+        assert (bool(credit.text), credit.lost) == (True, lost)
     assert credit_soaks(state, set_up, Surroundings(0, pv_degC=math.nan)).lost
     cold = apply_entry(state, Cooled(0))
     assert credit_soaks(cold, set_up, Surroundings(0, pv_degC=30.0)).lost

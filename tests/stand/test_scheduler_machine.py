@@ -73,7 +73,7 @@ lives = precondition(lambda self: not self.life.run.done())
 
 
 class RunMachine(RuleBasedStateMachine):
-    """One night of several lives; `holding` is what was asked for and not taken back."""
+    """One session of several lives; `holding` is what was asked for and not taken back."""
 
     def __init__(self):
         super().__init__()
@@ -317,5 +317,5 @@ TestRunMachine.settings = runs_of(40, derandomize=True)
 
 
 @pytest.mark.nightly
-class TestRunMachineByNight(RunMachine.TestCase):
+class TestRunMachineNightly(RunMachine.TestCase):
     settings = runs_of(4000, derandomize=False)

@@ -60,7 +60,7 @@ async def test_requests_are_answered_in_their_order_whole_byte_by_byte_and_many_
         assert [line.split(" ")[:2] for line in answers] == [["pong", str(number)] for number in range(200)]
 
 
-async def test_there_is_room_for_one_more_and_strangers_leave_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+async def test_one_more_is_admitted_and_strangers_leave_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(secop, "_SPEAK_WITHIN_S", 1.0)
     desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as known:

@@ -18,7 +18,7 @@ def seen(here: MemoryStand):
     return snapshot_state(load_config(find_packaged("", "simulated")), here.stand, here.hub, here.clock)
 
 
-async def test_after_a_stop_while_a_wire_is_gone_it_is_told_what_is_not_confirmed_until_it_is():
+async def test_after_a_stop_while_a_wire_is_gone_what_is_not_confirmed_is_reported_until_it_is():
     async with run_memory_stand() as here:
         for part in (here.relays, here.regulator, here.flap):
             here.stand.opened(cast("Any", part))

@@ -44,7 +44,7 @@ def test_programs_get_events_one_a_line(capsys: pytest.CaptureFixture[str]):
     }
 
 
-def test_a_port_in_use_is_said_before_any_device_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_port_in_use_is_reported_before_any_device_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     opened: list[object] = []
     monkeypatch.setattr(serve_cli, "serve_stand", lambda *args, **_: opened.append(args))
     with socket.create_server(("127.0.0.1", 0)) as taken:

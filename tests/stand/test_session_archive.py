@@ -13,16 +13,16 @@ from thermostand.stand.commands.sessions.session_commands import app
 
 
 @pytest.fixture(scope="module")
-def nights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("nights")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cycles")
     asyncio.run(record_run(folder / "a"))
     asyncio.run(record_run(folder / "killed", publish_killed, ""))
     return folder
 
 
 @pytest.fixture
-def sessions(nights: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(nights, tmp_path / "sessions"))
+def sessions(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "sessions"))
 
 
 def ask(*arguments: object, status: int = 0):
@@ -60,7 +60,7 @@ def test_a_place_is_needed_and_not_among_the_sessions(sessions: Path):
     assert "on another disk" in ask("archive", sessions, "--to", sessions / "x", status=2).stderr
 
 
-def test_copies_elsewhere_do_not_count_and_one_that_is_gone_is_said_to_be(sessions: Path, tmp_path: Path):
+def test_copies_elsewhere_do_not_count_and_a_missing_one_is_reported(sessions: Path, tmp_path: Path):
     nas, other = tmp_path / "nas", tmp_path / "other"
     ask("archive", sessions, "--to", nas)
     found = json.loads(ask("archive", sessions, "--to", other, "--json").stdout)

@@ -91,9 +91,9 @@ def test_notes_and_tags_are_listed_and_found(session: Path):
     assert line.endswith("paper,lens-B  door opened")
     ask("tag", session, "lens-B", "--remove")
     assert "tag lens-B" in ask("list", session.parent, "--tag", "lens-B").stderr
-    said = ask("info", session).stdout
-    assert "tags          paper" in said
-    assert ": door opened" in said
+    answer = ask("info", session).stdout
+    assert "tags          paper" in answer
+    assert ": door opened" in answer
     assert "one word" in read_refusal("tag", session, "two words")
     assert ask("verify", session).stdout.endswith("read\n")
 
@@ -123,8 +123,8 @@ def test_a_list_of_known_sessions_imports_nothing_that_takes_time(session: Path)
 def test_a_folder_without_sessions_and_no_folder(tmp_path: Path):
     assert "no sessions there" in ask("list", tmp_path).stderr
     assert "no such folder" in read_refusal("list", tmp_path / "nowhere")
-    (tmp_path / "night.mcap").write_bytes(b"")
-    assert "night.mcap: is a file" in read_refusal("list", tmp_path / "night.mcap")
+    (tmp_path / "cycle.mcap").write_bytes(b"")
+    assert "cycle.mcap: is a file" in read_refusal("list", tmp_path / "cycle.mcap")
 
 
 def test_a_folder_of_sessions_is_no_session_and_says_which_command_shows_them(session: Path):
@@ -137,9 +137,9 @@ def test_a_folder_of_sessions_is_no_session_and_says_which_command_shows_them(se
 def test_info_tells_a_person_what_was_recorded(session: Path):
     output = ask("info", session).stdout
     assert max(map(len, output.splitlines())) <= 100
-    said = " ".join(output.split())
+    answer = " ".join(output.split())
     for fact in (
-        f"session {session.name}, recorded as night-1",
+        f"session {session.name}, recorded as cycle-1",
         "run interrupted",
         "files sound",
         "recipe thermal_cycle",
@@ -158,7 +158,7 @@ def test_info_tells_a_person_what_was_recorded(session: Path):
         "events 12 warning",
         "2026-01-01 18:00:02 warning: half second 4, 5 µm",
     ):
-        assert fact in said
+        assert fact in answer
 
 
 def test_info_tells_what_the_recorder_lost(tmp_path: Path):
@@ -167,8 +167,8 @@ def test_info_tells_what_the_recorder_lost(tmp_path: Path):
         yield Event(time_ns, "error", "frames_dropped", "frames lost: 1", {"blocks": [[index, index]]})
 
     asyncio.run(record(tmp_path / "s", 3, items=items))
-    said = " ".join(ask("info", tmp_path / "s").stdout.split())
-    assert "; 1 lost by the camera" in said
+    answer = " ".join(ask("info", tmp_path / "s").stdout.split())
+    assert "; 1 lost by the camera" in answer
 
 
 def test_info_as_json_has_everything_and_no_nan(session: Path):
@@ -187,16 +187,16 @@ def test_info_as_json_has_everything_and_no_nan(session: Path):
 def test_info_says_what_is_unfinished_and_what_to_do(session: Path):
     path = session / "frames" / "0001.mcap"
     path.rename(path.with_name("0001.mcap.part"))
-    said = " ".join(ask("info", session).stdout.split())
-    assert "files incomplete" in said
-    assert "frames/0001.mcap.part is unfinished (" in said
-    assert f"stand session repair {session}" in said
+    answer = " ".join(ask("info", session).stdout.split())
+    assert "files incomplete" in answer
+    assert "frames/0001.mcap.part is unfinished (" in answer
+    assert f"stand session repair {session}" in answer
 
 
 def test_verify_tells_what_was_lost_before_the_recording_and_that_the_session_is_sound(session: Path):
     lines = ask("verify", session).stdout.splitlines()
-    told = [line.partition(" lost by ")[0] for line in lines[:-1]]
-    assert told == [f"note: 1 frame of step {k} (capture)" for k in range(2, 13, 2)]
+    reasons = [line.partition(" lost by ")[0] for line in lines[:-1]]
+    assert reasons == [f"note: 1 frame of step {k} (capture)" for k in range(2, 13, 2)]
     assert lines[-1].startswith("files sound; run interrupted; 7 segments, 143 messages, 12 frames, ")
 
 
@@ -284,7 +284,7 @@ def test_export_writes_images_and_tables(session: Path, tmp_path: Path):
 
 
 def test_export_writes_one_file_for_a_viewer(session: Path, tmp_path: Path):
-    out = tmp_path / "night.mcap"
+    out = tmp_path / "cycle.mcap"
     assert ask("export", session, "--out", out, "--format", "mcap").stdout == f"{out}\n"
     assert out.read_bytes()[:5] == b"\x89MCAP"
     assert "exists already" in read_refusal("export", session, "--out", out, "--format", "mcap")

@@ -31,7 +31,7 @@ def stepped(time_ns: int, index: int):
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("sessions") / "night"
+    directory = tmp_path_factory.mktemp("sessions") / "cycle"
     asyncio.run(record(directory, 12, stepped))
     return directory
 
@@ -103,7 +103,7 @@ def test_a_part_is_cut_by_utc_and_knows_its_own(session: Path, tmp_path: Path):
 
 
 def test_what_verify_finds_is_reported_in_utc(session: Path, tmp_path: Path):
-    damaged = Path(shutil.copytree(session, tmp_path / "night"))
+    damaged = Path(shutil.copytree(session, tmp_path / "cycle"))
     for segment in sorted((damaged / "frames").iterdir())[-1:]:
         segment.unlink()
     reported = "\n".join(map(str, verify(damaged).findings))

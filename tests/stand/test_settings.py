@@ -79,7 +79,7 @@ def test_every_settings_model_of_a_driver_is_a_part_of_the_stands_file():
     } == REGISTER_MAP | base
 
 
-def test_a_driver_that_takes_settings_takes_none_of_their_keys_beside_them():
+def test_a_driver_that_takes_settings_takes_none_of_their_keys_as_parameters():
     keys = {name for model in models_in(StandConfig) for name in model.model_fields}
     made = [
         inspect.signature(each)
@@ -93,7 +93,7 @@ def test_a_driver_that_takes_settings_takes_none_of_their_keys_beside_them():
 
 def test_no_dataclass_repeats_settings():
     settings = [set(model.model_fields) for model in models_in(StandConfig)]
-    rooms = (
+    routes = (
         thermostand.drivers.devices,
         thermostand.drivers.wires,
         thermostand.stand,
@@ -103,7 +103,7 @@ def test_no_dataclass_repeats_settings():
     )
     repeated = {
         each.__name__
-        for each in classes(*rooms)
+        for each in classes(*routes)
         if dataclasses.is_dataclass(each)
         and len(dataclasses.fields(each)) > 1
         and any({field.name for field in dataclasses.fields(each)} <= keys for keys in settings)

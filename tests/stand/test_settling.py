@@ -168,7 +168,7 @@ def detection(centres_px: NDArray[Any]) -> Detection:
         growth=np.ones(2),
         excess_px2=np.zeros(2),
         band_sigma=9.0,
-        is_doubtful=False,
+        is_suspect=False,
         state=EdgeState(np.zeros((count, 12)), np.ones(count)),
     )
 

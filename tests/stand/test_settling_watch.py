@@ -90,7 +90,7 @@ def test_looks_wait_for_the_chamber(life: Callable[..., Life]):
     assert 600.0 + SOONEST_S - 60.0 < soaked_s(here) < 600.0 + LATEST_S
 
 
-def test_a_pause_keeps_what_was_earned_but_begins_a_new_window(life: Callable[..., Life]):
+def test_a_pause_keeps_the_soak_time_but_begins_a_new_window(life: Callable[..., Life]):
     here = life()
     here.passes(200.0)
     here.call(lambda: here.stand.gate.hold(OPERATOR))
@@ -115,7 +115,7 @@ def test_an_interlock_begins_a_new_window(life: Callable[..., Life]):
     assert here.wrong == []
 
 
-def test_a_killed_soak_goes_on_with_what_it_had_earned_and_a_new_window(life: Callable[..., Life]):
+def test_a_killed_soak_goes_on_with_its_soak_time_and_a_new_window(life: Callable[..., Life]):
     first = life()
     first.passes(200.0)
     second = life(start_ns=killed(first))
@@ -126,7 +126,7 @@ def test_a_killed_soak_goes_on_with_what_it_had_earned_and_a_new_window(life: Ca
     assert reported(second)[0].startswith("settled after 8 min")
 
 
-def test_a_target_that_is_not_there_lets_the_soak_end_at_its_longest(life: Callable[..., Life]):
+def test_a_missing_target_lets_the_soak_end_at_its_longest(life: Callable[..., Life]):
     here = life()
     here.stand.image = np.full((512, 612), 120, np.uint8)
     here.passes(1900.0)

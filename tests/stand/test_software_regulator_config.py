@@ -23,7 +23,7 @@ def module(**keys: object) -> Change:
     return change
 
 
-def module_beside_the_relay(data: dict[str, Any]) -> None:
+def module_with_the_relay(data: dict[str, Any]) -> None:
     module()(data)
     data["relays"]["channels"]["heat"] = 3
 
@@ -48,7 +48,7 @@ REFUSED: list[tuple[str, Change, str]] = [
     ("software-regulator", lambda d: d["regulator"].update(sample_s=1), "sample_s is shorter than thermometer_module"),
     ("software-regulator", lambda d: d["regulator"]["pulses"].update(cycle_s=60), "longer than guard.heater_hold_s"),
     ("software-regulator", lambda d: d["regulator"]["law"].update(lowest_percent=-8), "never starts the compressor"),
-    ("software-regulator", module_beside_the_relay, "take one of them to heat with"),
+    ("software-regulator", module_with_the_relay, "take one of them to heat with"),
     ("software-regulator", module(watchdog_s=6), r"heat_module\.watchdog_s must be at least twice regulator\.sample_s"),
     ("software-regulator", module(watchdog_s=25), "longer than guard.heater_hold_s"),
     ("software-regulator", module(unit=3), "need different units on one bus"),

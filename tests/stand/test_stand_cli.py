@@ -120,7 +120,7 @@ def test_a_target_that_is_none_is_refused_before_anything_moves(tmp_path: Path):
     assert len(result.output.strip().splitlines()) == 1
 
 
-def test_a_usage_error_is_said_in_plain_lines():
+def test_a_usage_error_is_reported_in_plain_lines():
     result = runner.invoke(app, ["run", "demo", "--seed", "many"])
     assert result.exit_code == 2
     assert "'--seed'" in result.output.strip().splitlines()[-1]

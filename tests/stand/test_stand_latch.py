@@ -1,4 +1,5 @@
-"""A stand's latch: on the disk before anything is said, found again, and not taken for none when it is unreadable."""
+"""A stand's latch: on the disk before anything is reported, found again, and not taken for none when it is
+unreadable."""
 
 import threading
 from collections.abc import Callable

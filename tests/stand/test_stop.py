@@ -50,7 +50,7 @@ def pressed(port: int) -> dict[str, Any]:
     return post(port)[1]
 
 
-def said(port: int, *parts: bytes) -> bytes:
+def exchange(port: int, *parts: bytes) -> bytes:
     """All that comes back for these, each of them sent on its own, until the daemon hangs up."""
     with socket.create_connection(("127.0.0.1", port), LIMIT_S) as client:
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -63,7 +63,7 @@ def said(port: int, *parts: bytes) -> bytes:
 @contextlib.asynccontextmanager
 async def open_stand(folder: Path, **interface: Any) -> AsyncIterator[tuple[FakeService, int]]:
     port = free_port()
-    async with serve_fake(FakeService(), folder / "night", Interface(folder, port=port, **interface)) as desk:
+    async with serve_fake(FakeService(), folder / "cycle", Interface(folder, port=port, **interface)) as desk:
         yield desk, port
 
 
@@ -94,7 +94,7 @@ async def test_a_stop_is_done_and_answered_whatever_others_do(tmp_path: Path, na
         with contextlib.ExitStack() as stack:
             stack.push(flood)
             assert (await asyncio.to_thread(pressed, port))["verb"] == "stop"
-            assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
+            assert (await asyncio.to_thread(ask, tmp_path / "cycle", "stop"))["verb"] == "stop"
     assert "loopback" in [who.how for who, verb, _ in desk.orders if verb == "stop"]
 
 
@@ -119,15 +119,17 @@ class Stuck:
 
 
 async def test_a_stop_does_not_wait_for_what_serves_the_others(tmp_path: Path):
-    room = Stuck()
-    async with open_stand(tmp_path, extra_routes=(room,)) as (desk, port):
-        waiting = asyncio.create_task(asyncio.to_thread(said, port, b"GET /stuck HTTP/1.1\r\nHost: localhost\r\n\r\n"))
-        await asyncio.to_thread(room.has_begun.wait, LIMIT_S)
+    routes = Stuck()
+    async with open_stand(tmp_path, extra_routes=(routes,)) as (desk, port):
+        waiting = asyncio.create_task(
+            asyncio.to_thread(exchange, port, b"GET /stuck HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        )
+        await asyncio.to_thread(routes.has_begun.wait, LIMIT_S)
         assert (await asyncio.to_thread(post, port))[1]["verb"] == "stop"
-        assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(ask, tmp_path / "cycle", "stop"))["verb"] == "stop"
         assert not waiting.done()
         assert [who.how for who, _, _ in desk.orders] == ["loopback", "socket"]
-        room.end()
+        routes.end()
         assert b"HTTP/1.1 200" in await waiting
 
 
@@ -149,7 +151,7 @@ async def test_a_stop_is_understood_however_it_is_sent_and_its_body_is_not_waite
     tmp_path: Path, parts: tuple[bytes, ...]
 ):
     async with open_stand(tmp_path) as (desk, port):
-        answer = await asyncio.to_thread(said, port, *parts)
+        answer = await asyncio.to_thread(exchange, port, *parts)
     head, _, body = answer.partition(b"\r\n\r\n")
     assert head.startswith(b"HTTP/1.1 200 OK\r\n")
     assert b"connection: close" in head.lower()
@@ -158,7 +160,7 @@ async def test_a_stop_is_understood_however_it_is_sent_and_its_body_is_not_waite
     assert [verb for _, verb, _ in desk.orders] == ["stop"]
 
 
-async def test_who_may_not_stop_is_told_why(tmp_path: Path):
+async def test_who_may_not_stop_gets_the_reason(tmp_path: Path):
     async with open_stand(tmp_path, tokens=book()) as (desk, port):
         for status, headers in (
             (403, {"Host": "evil.example"}),
@@ -182,7 +184,7 @@ async def test_a_viewer_that_speaks_before_it_is_let_in_is_left_without_a_failur
             viewer.sendall(PING * 1000)  # who was let in, and goes on so, has to leave
             while await asyncio.to_thread(viewer.recv, 1 << 16):
                 pass
-        assert (await asyncio.to_thread(find_session_server(tmp_path / "night").state)).stand == "a stand"
+        assert (await asyncio.to_thread(find_session_server(tmp_path / "cycle").state)).stand == "a stand"
     assert caplog.records == []
 
 
@@ -198,9 +200,9 @@ async def test_a_stop_that_ends_the_daemon_is_answered(tmp_path: Path, way: str)
     port = free_port()
 
     def stop() -> Any:
-        return post(port)[1]["verb"] if way == "over TCP" else ask(tmp_path / "night", "stop")["verb"]
+        return post(port)[1]["verb"] if way == "over TCP" else ask(tmp_path / "cycle", "stop")["verb"]
 
-    async with serve_fake(Ending(), tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(Ending(), tmp_path / "cycle", Interface(tmp_path, port=port)):
         stopping = asyncio.create_task(asyncio.to_thread(stop))
         await ended.wait()
     assert await stopping == "stop"
@@ -212,7 +214,7 @@ async def test_every_answer_over_the_network_ends_its_connection_so_that_stop_is
     async with open_stand(tmp_path) as (_, port):
         for path in (b"/healthz", b"/api/v1/state", b"/nothing"):
             request = b"GET " + path + b" HTTP/1.1\r\nHost: localhost\r\n\r\n"
-            assert (await asyncio.to_thread(said, port, request)).count(b"connection: close") == 1
+            assert (await asyncio.to_thread(exchange, port, request)).count(b"connection: close") == 1
 
 
 async def test_without_its_thread_stop_is_served_as_everything_else_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -226,6 +228,6 @@ async def test_without_its_thread_stop_is_served_as_everything_else_is(tmp_path:
         with contextlib.suppress(OSError, http.client.HTTPException):
             await asyncio.to_thread(post, port)
         assert (await asyncio.wait_for(failures.get(), LIMIT_S)).kind in ("command", "interface_failed")
-        assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(ask, tmp_path / "cycle", "stop"))["verb"] == "stop"
         assert (await asyncio.to_thread(post, port))[1]["verb"] == "stop"
-        assert (await asyncio.to_thread(find_session_server(tmp_path / "night").state)).stand == "a stand"
+        assert (await asyncio.to_thread(find_session_server(tmp_path / "cycle").state)).stand == "a stand"

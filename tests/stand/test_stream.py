@@ -39,7 +39,7 @@ async def until(viewer: ClientConnection, kind: str) -> dict[str, Any]:
 @asynccontextmanager
 async def opened(tmp_path: Path, desk: FakeService) -> AsyncIterator[str]:
     port = free_port()
-    async with serve_fake(desk, tmp_path / "night", Interface(tmp_path, port=port)):
+    async with serve_fake(desk, tmp_path / "cycle", Interface(tmp_path, port=port)):
         yield f"ws://127.0.0.1:{port}/api/v1/stream"
 
 
@@ -67,7 +67,7 @@ async def test_a_command_is_an_event_with_its_number_and_who_gave_it(tmp_path: P
     desk = FakeService()
     async with opened(tmp_path, desk) as url, connect(url) as viewer:
         await message(viewer)
-        done = await asyncio.to_thread(ask, tmp_path / "night", "pause")
+        done = await asyncio.to_thread(ask, tmp_path / "cycle", "pause")
         event = await until(viewer, "event")
         assert event["seq"] == done["seq"]
         who = desk.orders[0][0]
@@ -113,7 +113,7 @@ async def test_a_client_that_reconnects_gets_what_was_missed_and_learns_what_is_
             assert (await message(viewer))["type"] == "gone"
             assert (await message(viewer))["seq"] == first + 15
         found = await asyncio.to_thread(
-            find_session_server(tmp_path / "night").request, "GET", f"/api/v1/events?from={first + 20}"
+            find_session_server(tmp_path / "cycle").request, "GET", f"/api/v1/events?from={first + 20}"
         )
         assert isinstance(found, dict)
         assert (found["gone"], [each["text"] for each in found["events"]]) == (False, ["16", "17", "18", "19"])
@@ -151,7 +151,7 @@ async def test_what_nobody_takes_is_dropped_and_counted():
     bridge.close()
 
 
-async def test_a_control_loop_that_hangs_is_said_to_and_orders_time_out():
+async def test_a_control_loop_that_hangs_is_reported_and_orders_time_out():
     desk = FakeService()
     bridge = Bridge(desk)
 
@@ -171,7 +171,7 @@ async def test_viewers_beyond_the_most_are_refused_and_cost_nobody_a_place(tmp_p
         viewers = [await connect(url) for _ in range(MOST_VIEWERS)]
         with pytest.raises(Exception, match="503"):
             await connect(url)
-        assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(ask, tmp_path / "cycle", "stop"))["verb"] == "stop"
         for viewer in viewers:
             assert (await message(viewer))["type"] == "state"
             await viewer.close()
@@ -186,7 +186,7 @@ async def test_viewers_beyond_the_most_are_refused_and_cost_nobody_a_place(tmp_p
 
 
 async def test_the_unix_socket_has_the_stream_too(tmp_path: Path):
-    desk, session = FakeService(), tmp_path / "night"
+    desk, session = FakeService(), tmp_path / "cycle"
     async with serve_fake(desk, session):
         (daemon,) = [each for each in list_daemons() if each.entry.session == str(session)]
         async with unix_connect(str(daemon.socket), "ws://localhost/api/v1/stream") as viewer:
@@ -213,7 +213,7 @@ async def test_a_viewer_that_sends_is_disconnected_and_takes_no_stop_away(tmp_pa
         with pytest.raises(ConnectionClosed):
             await flooding(viewer, sent)
         assert viewer.close_code in (CloseCode.POLICY_VIOLATION, CloseCode.MESSAGE_TOO_BIG, CloseCode.ABNORMAL_CLOSURE)
-        assert (await asyncio.to_thread(ask, tmp_path / "night", "stop"))["verb"] == "stop"
+        assert (await asyncio.to_thread(ask, tmp_path / "cycle", "stop"))["verb"] == "stop"
         assert await quiet.ping()
     assert [verb for _, verb, _ in desk.orders] == ["stop"]
 

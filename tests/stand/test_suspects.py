@@ -45,7 +45,7 @@ def found(
     pair: tuple[str, str],
     moves: dict[str, Callable[[float], float]],
     others: dict[str, float] | None = None,
-    doubted: str = "",
+    reported: str = "",
 ) -> Fault | None:
     """What a disagreement of 3 K says of air at rest of 30 degC, from which channels move (K by seconds since then);
     others: what heat, cold and set-point are since."""
@@ -64,8 +64,8 @@ def found(
         values = {name: 30.0 + 20.0 * (name == CAMERA) + move(since_s) for name, move in moves.items()}
         values |= settings | ((others or {}) if since_s >= 0 else {})
         readings = [Reading(name, value, "1", now_ns) for name, value in values.items()]
-        if doubted and since_s > 0:
-            readings.append(Reading(doubted, values[doubted], "1", now_ns, Quality.STALE, "it jumped", "doubt"))
+        if reported and since_s > 0:
+            readings.append(Reading(reported, values[reported], "1", now_ns, Quality.STALE, "it jumped", "suspect"))
         hub.publish(Batch("stand", now_ns, tuple(readings)))
         if (fault := rule(hub, now_ns)) is not None:
             return fault
@@ -91,7 +91,7 @@ BODIES_OF_UP = {CAMERA: follows(UP, 600.0), GRANITE: follows(UP, 4000.0)}
 
 
 @pytest.mark.parametrize(
-    ("moves", "others", "doubted", "suspect"),
+    ("moves", "others", "reported", "suspect"),
     [
         ({PV: still, AIR: still, CEILING: UP}, {}, "", None),
         ({PV: UP, AIR: still, CEILING: still}, {}, "", PV),
@@ -122,9 +122,9 @@ BODIES_OF_UP = {CAMERA: follows(UP, 600.0), GRANITE: follows(UP, 4000.0)}
     ],
 )
 def test_two_probes(
-    moves: dict[str, Callable[[float], float]], others: dict[str, float], doubted: str, suspect: str | None
+    moves: dict[str, Callable[[float], float]], others: dict[str, float], reported: str, suspect: str | None
 ):
-    fault = found((PV, AIR), moves, others, doubted)
+    fault = found((PV, AIR), moves, others, reported)
     if suspect is None:
         assert fault is None
         return

@@ -152,25 +152,25 @@ def test_steps_before_the_running_one_are_not_waited_for(config: StandConfig):
 
 async def test_runs_teach_what_work_takes_and_the_median_counts(tmp_path: Path, config: StandConfig):
     plan = make_priced_plan(MoveTo("linear", 0.0), CloseFlap(), OpenFlap(), Soak(5.0), CAPTURE, CloseFlap())
-    for night, travel_s in enumerate((1.0, 1.2, 40.0)):
-        await recorded(tmp_path / f"night-{night}", config.name, plan, [8.0, 0.2, travel_s, 5.0, 1.5, travel_s])
-    await recorded(tmp_path / "night-other", "another-stand", plan, [9.0] * 6)
-    (tmp_path / "night-none").mkdir()
+    for number, travel_s in enumerate((1.0, 1.2, 40.0)):
+        await recorded(tmp_path / f"cycle-{number}", config.name, plan, [8.0, 0.2, travel_s, 5.0, 1.5, travel_s])
+    await recorded(tmp_path / "cycle-other", "another-stand", plan, [9.0] * 6)
+    (tmp_path / "cycle-none").mkdir()
     learned = learn_durations(tmp_path, config)
-    assert learned.nights == ("night-0", "night-1", "night-2")
+    assert learned.learned_from == ("cycle-0", "cycle-1", "cycle-2")
     assert learned.overheads_s["flap travel"] == pytest.approx(1.2, abs=1e-3)
     assert learned.overheads_s["flap at rest"] == pytest.approx(0.2, abs=1e-3)
     assert learned.overheads_s["capture"] == pytest.approx(0.4, abs=1e-3)
     assert "home and move linear" in learned.overheads_s
     assert load_learned_durations(tmp_path) == learned
-    assert "3 runs, the last night-2" in str(learned)
+    assert "3 runs, the last cycle-2" in str(learned)
     assert [path.name for path in tmp_path.glob(f"{LEARNED_FILE}*")] == [LEARNED_FILE]
 
 
 async def test_a_step_that_was_begun_again_teaches_nothing(tmp_path: Path, config: StandConfig):
     plan = make_priced_plan(OpenFlap(), CloseFlap())
     killed, *rest = marks([plan[0], *plan], [2.0, 0.4, 1.1])
-    session = await recorded_marks(tmp_path / "night", config.name, [killed, *rest[1:]])
+    session = await recorded_marks(tmp_path / "cycle", config.name, [killed, *rest[1:]])
     assert compute_overheads(session.steps(), config) == [("flap travel", pytest.approx(1.1, abs=1e-3))]
 
 

@@ -50,7 +50,7 @@ def test_a_token_is_made_listed_known_and_taken_back(config: Path):
     assert (left.tokens, list(left.read_only)) == ({}, ["wall"])
 
 
-def test_without_a_file_in_the_configuration_it_is_said_where_to_name_one():
+def test_without_a_file_in_the_configuration_the_error_says_where_to_name_one():
     reported = invoke("add", "rose")
     assert reported.exit_code == 2
     assert "has no interface.secrets" in reported.stderr
@@ -68,7 +68,7 @@ def test_without_a_file_in_the_configuration_it_is_said_where_to_name_one():
         f"read_olny: {{wall: {TOKEN}}}",
     ],
 )
-def test_what_is_wrong_in_the_file_is_said_without_a_word_of_it(tmp_path: Path, content: str):
+def test_what_is_wrong_in_the_file_is_reported_without_a_word_of_it(tmp_path: Path, content: str):
     path = tmp_path / "tokens.yaml"
     path.write_text(content)
     path.chmod(0o600)

@@ -85,13 +85,13 @@ class Surfaces:
         state = await asyncio.to_thread(find_session_server(self.session).state)
         over_tcp = await asyncio.to_thread(self.http.state)
         shown = await asyncio.to_thread(CliRunner().invoke, stand, ["status", str(self.session), "--json"])
-        said: Any = json.loads(shown.output)["stand"]
+        status: Any = json.loads(shown.output)["stand"]
         text, code = await self.by_secop(NOTHING if state.fault is None else state.fault.text)
         answers = [each.fault and (each.fault.rule, each.fault.text) for each in (state, over_tcp)]
-        answers += [said["fault"] and (said["fault"]["rule"], said["fault"]["text"])]
+        answers += [status["fault"] and (status["fault"]["rule"], status["fault"]["text"])]
         answers += [(state.fault.rule if state.fault else "?", text) if text else None]
         tripped = state.fault is not None
-        assert ("interlock" in state.reasons, "interlock" in said["reasons"], code >= SECOP_ERROR) == (tripped,) * 3
+        assert ("interlock" in state.reasons, "interlock" in status["reasons"], code >= SECOP_ERROR) == (tripped,) * 3
         assert self.is_barred() is tripped
         assert self.guard.may_permit() is False
         assert len(set(answers)) == 1
@@ -100,9 +100,9 @@ class Surfaces:
     async def by_secop(self, text: str) -> tuple[str, int]:
         """What has tripped, and the status of the run; the node looks at the stand again after a moment."""
         async with talking(self.secop_port) as talk, asyncio.timeout(20.0):
-            while (said := (await talk.asked("read run:_fault"))[2][0]) != text:
+            while (status := (await talk.asked("read run:_fault"))[2][0]) != text:
                 await asyncio.sleep(0.05)
-            return said, (await talk.asked("read run:status"))[2][0][0]
+            return status, (await talk.asked("read run:status"))[2][0][0]
 
     def is_barred(self) -> bool:
         """Whether the interlock lets nothing move."""
@@ -122,9 +122,9 @@ async def started(config_file: Path, folder: Path) -> AsyncGenerator[Surfaces]:
     await open_stand.latch.restore()
     open_stand.prepare()
     interface = Interface(folder, port=port, doors=(make_secop_listener(secop_port),), trusts_loopback=True)
-    async with serve(StandService(Host(open_stand)), folder / "night", config.name, interface):
+    async with serve(StandService(Host(open_stand)), folder / "cycle", config.name, interface):
         await asyncio.sleep(0)
-        yield Surfaces(open_stand, folder / "night", make_server(f"http://127.0.0.1:{port}", None), secop_port)
+        yield Surfaces(open_stand, folder / "cycle", make_server(f"http://127.0.0.1:{port}", None), secop_port)
     await open_stand.assembly.stand.safety.close()
 
 

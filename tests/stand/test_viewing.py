@@ -38,8 +38,8 @@ def moment(time_ns: int, index: int, role: str | None = None):
 @pytest.fixture
 async def session(tmp_path: Path) -> Path:
     """An interrupted run."""
-    await record(tmp_path / "night", len(ROLES), moment)
-    return tmp_path / "night"
+    await record(tmp_path / "cycle", len(ROLES), moment)
+    return tmp_path / "cycle"
 
 
 class Looking:

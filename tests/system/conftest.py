@@ -24,7 +24,7 @@ from thermostand.stand.config.stand_config import StandConfig, find_packaged, lo
 from thermostand.stand.running.order import Order
 
 WHOLE_SENSOR: dict[str, object] = {"width_px": None, "height_px": None}
-# Rendered and sent whole a frame costs as much as ten minutes of a night.
+# Rendered and sent whole a frame costs as much as ten minutes of a session.
 CORNER: dict[str, object] = {"width_px": 612, "height_px": 64}
 AS_INSTALLED: dict[str, dict[str, object]] = {
     "regulator": {"poll_s": 5.0},
@@ -32,7 +32,7 @@ AS_INSTALLED: dict[str, dict[str, object]] = {
     "camera": {"poll_s": 5.0},
     "guard": {"period_s": 5.0, "stale_after_s": 15.0, "heater_hold_s": 15.0, "heater_renew_s": 5.0},
 }
-# Half as often: a night of virtual time then takes half the processor time.
+# Half as often: a session of virtual time then takes half the processor time.
 CALM: dict[str, dict[str, object]] = {
     "regulator": {"poll_s": 10.0},
     "thermometer_module": {"poll_s": 10.0},

@@ -27,7 +27,7 @@ PAUSE_S = 0.005
 
 
 def journal_entry(index):
-    return Begun(0, "night-1", "0f", {}) if index == 0 else Soaked(index, f"soak-{index}", float(index))
+    return Begun(0, "cycle-1", "0f", {}) if index == 0 else Soaked(index, f"soak-{index}", float(index))
 
 
 def compressor_state(index):

@@ -8,7 +8,7 @@
    BUS     a command may be on its way
 
    Left out: the regulator's own limits, the thermal cut-out, and what a second master does to the regulator. Assumed: a
-   timed-on replaces a steady one, and begins anew when it comes again (the test of the timer at each start). */
+   timed-on replaces a steady one, and begins again when it comes again (the test of the timer at each start). */
 
 /* Heat after the last look of a guard. Once HOLD would do, but for a program that is stopped between asking the guard and
    sending, and goes on for an instant later. */

@@ -25,7 +25,7 @@ from thermostand.stand.running.memory.entries import Begun, Ended, Soaked
 from thermostand.stand.running.memory.journal import Journal, Logbook
 from thermostand.stand.running.memory.state import RunState
 
-INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
+INFO = SessionInfo("cycle-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings("raw", telemetry_commit_s=0.05, stop_frames_below_bytes=0, alert_below_fraction=0.0)
 IMAGE = np.zeros((100, 100), np.uint8)
 
@@ -54,7 +54,7 @@ async def main(directory):
     await recorder.begin(tuple)
     recording = asyncio.create_task(recorder.run())
     log, journal = Logbook(hub, clock, RunState(())), Journal.create(directory)
-    await log.begin(journal, Begun(clock.now_ns(), "night-1", "0f", {}), disk=disk)
+    await log.begin(journal, Begun(clock.now_ns(), "cycle-1", "0f", {}), disk=disk)
     recorder.watch_file(journal)
     publishing = asyncio.create_task(publish(hub, clock, journal))
     say(disk.pid)

@@ -65,7 +65,7 @@ def gateway(order: Order):
     bus = order.config.bus
     between = Gateway(int(bus.address.rpartition(":")[2]))
     try:
-        there = bus.model_copy(update={"address": f"tcp:127.0.0.1:{between.port}"})
-        yield between, replace(order, config=order.config.model_copy(update={"bus": there}))
+        tunnel = bus.model_copy(update={"address": f"tcp:127.0.0.1:{between.port}"})
+        yield between, replace(order, config=order.config.model_copy(update={"bus": tunnel}))
     finally:
         between.unplug()

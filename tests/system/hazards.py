@@ -203,7 +203,7 @@ HAZARDS = (
         (),
         ("not_recorded", "recording_ended", "disk_low", "folder_lost"),
         _NOTHING_HEATS,
-        ("system/test_guard_run.test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_room",),
+        ("system/test_guard_run.test_a_full_disk_trips_after_its_time_and_a_reset_frees_no_space",),
     ),
     Hazard(
         "a run waits for ever with the stand warm",
@@ -242,7 +242,7 @@ HAZARDS = (
         ),
         ("camera_temperature_bad", "sensor_jumped", "sensor_stuck", "sensor_implausible", "sensor_outside"),
         _NOTHING_HEATS,
-        ("stand/test_channels.test_a_camera_that_is_wrong_for_40_s_is_doubted_for_40_s",),
+        ("stand/test_channels.test_a_camera_that_is_wrong_for_40_s_is_suspect_for_40_s",),
     ),
     Hazard(
         "a frame is lost, damaged, or taken for another",

@@ -167,10 +167,10 @@ def logged_disk(folder, image, log):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, "-m", "tests.system.logged_disk", folder, image, log]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
-        said = server.stdout.readline().strip()
-        if said != "mounted":
+        line = server.stdout.readline().strip()
+        if line != "mounted":
             server.kill()
-            pytest.skip(said or "the logging disk did not begin")
+            pytest.skip(line or "the logging disk did not begin")
         try:
             yield folder
         finally:

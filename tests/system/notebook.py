@@ -1,4 +1,4 @@
-"""The notebook of the tutorial, executed: `python -m tests.system.notebook SESSIONS` writes its outputs anew, from the
+"""The notebook of the tutorial, executed: `python -m tests.system.notebook SESSIONS` writes its outputs again, from the
 folder that has `sessions` in it with the session of `stand run demo --virtual-time --seed 7`."""
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Outcome:
 def outcomes(order: Order, directory: Path, count: int) -> list[Outcome]:
     """`count` runs of the order, each in a process of its own, as many side by side as there are processors."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(lambda number: _run_apart(order, directory / f"night-{number}"), range(count)))
+        return list(pool.map(lambda number: _run_apart(order, directory / f"cycle-{number}"), range(count)))
 
 
 def _run_apart(order: Order, out: Path) -> Outcome:

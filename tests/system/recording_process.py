@@ -30,7 +30,7 @@ from thermostand.recording.writing.segment import MessageRecord
 
 START_NS = 1_767_290_400 * NS_PER_S
 PERIOD_NS = NS_PER_S // 100
-INFO = SessionInfo("night-1", "warm_up", "DA1234567", "M. Adamczyk", "0.1.0", "wall", host="laboratory")
+INFO = SessionInfo("cycle-1", "warm_up", "DA1234567", "M. Adamczyk", "0.1.0", "wall", host="laboratory")
 SETTINGS = RecordingSettings(
     telemetry_commit_s=0.002,
     segment_bytes=40_000,  # a dozen frames

@@ -1,4 +1,4 @@
-"""A daemon of its own that runs or resumes a night in virtual time, to be killed at a random moment.
+"""A daemon of its own that runs or resumes a session in virtual time, to be killed at a random moment.
 
 `python -m tests.system.resume_process` reads a pickled (order, out) or (None, session) from its standard input. It
 writes a line for each item of the hub: its type, and after a capture the instants of its frames, which are then on the

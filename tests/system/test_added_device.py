@@ -133,15 +133,15 @@ def test_the_check_looks_at_it_and_says_what_to_do(laboratory: StandConfig):
 
 
 def test_it_obeys_by_hand_and_is_safe_afterwards(laboratory: StandConfig):
-    def told(verb: str, **arguments: int) -> float:
+    def ask(verb: str, **arguments: int) -> float:
         done = asyncio.run(run_device_verb(laboratory, "beam", verb, arguments, None, print))
         ((reading,),) = (cast("list[dict[str, float]]", done.data),)
         return reading["value"]
 
-    assert told("shine", percent=40) == pytest.approx(0.4)
-    assert told("read") == 0.0
+    assert ask("shine", percent=40) == pytest.approx(0.4)
+    assert ask("read") == 0.0
     with pytest.raises(ConfigError, match=r"dim; .* read, shine"):
-        told("dim")
+        ask("dim")
 
 
 @pytest.mark.usefixtures("lamp")

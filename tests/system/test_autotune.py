@@ -1,4 +1,4 @@
-"""Autotuning that somebody starts at the regulator: held like manual mode, and the night goes on after `reset`."""
+"""Autotuning that somebody starts at the regulator: held like manual mode, and the session goes on after `reset`."""
 
 import asyncio
 from collections.abc import Callable, Coroutine

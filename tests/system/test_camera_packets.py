@@ -96,7 +96,7 @@ async def test_a_frame_with_a_packet_cut_short_is_never_used(wired: tuple[Virtua
         assert all(map(is_right, await grabbed(camera, clock, 1)))
 
 
-async def test_frames_larger_than_the_camera_has_said_are_counted_and_never_used(
+async def test_frames_larger_than_the_camera_has_announced_are_counted_and_never_used(
     wired: tuple[VirtualClock, FakeCamera],
 ):
     clock, fake = wired

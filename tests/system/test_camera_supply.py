@@ -70,11 +70,11 @@ async def test_a_soak_with_a_cold_camera_is_not_credited(tmp_path: Path, order: 
     assert next(event.kind for event in session.events() if event.time_ns == lost.time_ns) == "camera_supply_off"
     check_soaked(session, lost.time_ns)
     entries = read_lines((directory / JOURNAL_NAME).read_bytes())[0]
-    earned = [(entry.time_ns, entry.soaked_s) for entry in entries if isinstance(entry, Soaked)]
-    restarts = [time_ns for time_ns, soaked_s in earned if soaked_s == 0.0]
+    soaked = [(entry.time_ns, entry.soaked_s) for entry in entries if isinstance(entry, Soaked)]
+    restarts = [time_ns for time_ns, soaked_s in soaked if soaked_s == 0.0]
     assert len(restarts) == 1
     assert 0 <= restarts[0] - lost.time_ns < 90 * NS_PER_S
-    assert max(soaked_s for time_ns, soaked_s in earned if time_ns < restarts[0]) > 300.0
+    assert max(soaked_s for time_ns, soaked_s in soaked if time_ns < restarts[0]) > 300.0
     powered_ns, powered = session.readings("relays.camera_power")
     assert powered[powered_ns > restarts[0] + 60 * NS_PER_S].min() == 1
 

@@ -44,7 +44,7 @@ experiments:
         ),
     ],
 )
-def test_a_night_whose_camera_shows_no_temperature_is_refused_before_the_first_step(
+def test_a_session_whose_camera_shows_no_temperature_is_refused_before_the_first_step(
     tmp_path: Path, config_text: Callable[..., str], temperature: dict[str, object], sentence: str
 ):
     recipe, config = tmp_path / "recipe.yaml", tmp_path / "stand.yaml"

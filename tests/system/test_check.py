@@ -98,7 +98,7 @@ def test_without_moves_each_device_tells_what_it_is_and_the_record_goes_with_ses
     assert explain_unchecked(config, None, texts, is_simulated=True) == ""
 
 
-def test_what_is_wrong_is_said_of_its_device_and_keeps_none_of_the_others(config: Path) -> None:
+def test_what_is_wrong_is_reported_for_its_device_and_keeps_none_of_the_others(config: Path) -> None:
     known = yaml.safe_load(config.read_text())
     known["relays"]["unit"] = 7
     known["axes"]["linear"]["serial_number"] = 4109

@@ -72,14 +72,14 @@ async def test_a_stand_with_a_commercial_chamber_needs_no_relay_board(
 
 
 @pytest.mark.parametrize(
-    ("make", "name", "value", "said"),
+    ("make", "name", "value", "sentence"),
     [
         ("espec", "chamber.set_point_degC", 45, "set point changed at the unit, from "),
         ("julabo", "chamber.bank", 1, "working temperature T2 acts"),
     ],
 )
 async def test_a_set_point_changed_at_its_panel_holds_the_run(
-    tmp_path: Path, chamber_order: Callable[..., Order], make: str, name: str, value: int, said: str
+    tmp_path: Path, chamber_order: Callable[..., Order], make: str, name: str, value: int, sentence: str
 ):
     ordered, out, watcher = chamber_order(make, recipe=LONG_SOAK), tmp_path / "out", Watcher()
 
@@ -89,7 +89,7 @@ async def test_a_set_point_changed_at_its_panel_holds_the_run(
         await watcher.wait(1800)
         await fault(ordered, name, value)
         trip = await watcher.event("guard.device_fault", 300)
-        assert said in trip.text
+        assert sentence in trip.text
         await asyncio.to_thread(ask, directory, "stop")
 
     await run_operated(ordered, out, watcher, operate())

@@ -132,8 +132,11 @@ def test_a_served_stand_runs_what_is_queued_and_is_operated_by_hand_in_between(s
     assert second["id"] == 2
     assert running.queue[0].session.endswith("-brief")
     served.post(f"sessions/{done.queue[1].session}/notes", text="all well", tags=["good"])
-    said = read_notes(served.out / done.queue[1].session)
-    assert ([note.text for note in said.notes], said.tags) == (["a new lens", "all well"], ("lens-b", "good"))
+    by_operator = read_notes(served.out / done.queue[1].session)
+    assert ([note.text for note in by_operator.notes], by_operator.tags) == (
+        ["a new lens", "all well"],
+        ("lens-b", "good"),
+    )
     with pytest.raises(SessionError, match="no session of that"):
         served.post("sessions/no-such/notes", text="x")
     assert not done.heater_permitted
@@ -382,11 +385,11 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
     config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
     texts = {"config.yaml": laboratory.read_text(), "target.yaml": find_packaged("targets", config.target).read_text()}
     subscribers: list[int] = []
-    told: set[str] = set()
+    lines: set[str] = set()
 
     async def tell(hub: Hub, clock: WallClock) -> None:
         for number in itertools.count():
-            told.add(str(number))
+            lines.add(str(number))
             hub.publish(Event(clock.now_ns(), "info", "tick", str(number)))
             await asyncio.sleep(0.02)
 
@@ -427,4 +430,6 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
     await asyncio.wait_for(serve_stand(config, "a stand", texts, out, front), 3 * LIMIT_S)
     assert len(set(subscribers)) == 1
     recorded = {event.text for path in out.glob("2*") for event in Session.open(path).events() if event.kind == "tick"}
-    assert len(told - recorded) <= len(told) / 20  # a third of them, where nothing is recorded while a run is completed
+    assert (
+        len(lines - recorded) <= len(lines) / 20
+    )  # a third of them, where nothing is recorded while a run is completed

@@ -51,7 +51,7 @@ from thermostand.stand.service.counters import StoredCounters, load_counters
 START_NS = 1_767_290_400 * NS_PER_S
 TRIPPED, KILLED = "20260101T180000Z-tripped", "20260102T180000Z-killed"
 SECONDS = 30
-BY_DAY, BY_NIGHT = 6, 150  # seeds, each of every kind
+BY_DAY, NIGHTLY = 6, 150  # seeds, each of every kind
 SOUND_ONES = 8  # of so many states in which nothing of a session is hit one is read all the same
 NOW_NS, BOOT = START_NS + 9_000_000 * NS_PER_S, Boot("b007", 0)
 SETTINGS = RecordingSettings(segment_s=11.0, stop_frames_below_bytes=0, alert_below_fraction=0.0)
@@ -160,7 +160,7 @@ class Stand:
         counters = {f"relay_cycles.{n}": float(7**number + n) for n in range(20)}
         self.write(self.sessions / "daemon.json", "counters", StoredCounters(counters=counters))
         learned = LearnedDurations(
-            overheads_s={f"soak {n}": float(5**number + n) for n in range(20)}, nights=(str(number),)
+            overheads_s={f"soak {n}": float(5**number + n) for n in range(20)}, learned_from=(str(number),)
         )
         self.write(self.sessions / "learned.json", "learned", learned)
         write_tokens(self.tokens, tokens(number))
@@ -188,8 +188,8 @@ class Stand:
 
     def restore(self):
         """Everything as it is now."""
-        there = {str(path.relative_to(self.root)) for path in self.root.rglob("*") if path.is_file()}
-        for name in there - self.now.keys():
+        files = {str(path.relative_to(self.root)) for path in self.root.rglob("*") if path.is_file()}
+        for name in files - self.now.keys():
             (self.root / name).unlink()
         changed = {name: data for name, data in self.now.items() if self.is_changed(name, data)}
         put_back(changed, self.root)
@@ -262,9 +262,9 @@ def small_files(stand, state, names):
     if damage and "daemon.json" not in names:
         yield "sound counters are blamed"
     learned = load_learned_durations(stand.sessions)
-    if learned.nights not in [("4",), *([(), ("3",)] if "learned.json" in names else [])]:
-        yield f"learned {learned.nights}"
-    if learned.nights == ("4",) and learned.overheads_s != {f"soak {n}": float(625 + n) for n in range(20)}:
+    if learned.learned_from not in [("4",), *([(), ("3",)] if "learned.json" in names else [])]:
+        yield f"learned {learned.learned_from}"
+    if learned.learned_from == ("4",) and learned.overheads_s != {f"soak {n}": float(625 + n) for n in range(20)}:
         yield "what was learned is wrong and nothing says so"
     yield from queued(stand, names)
     with suppress(ConfigError):
@@ -295,28 +295,32 @@ def queued(stand, names):
         yield f"the queue is {runs} and nothing says so"
 
 
-def traceback_in(said):
-    if said.exception is not None and not isinstance(said.exception, SystemExit):
-        yield f"{said.exception!r}"
-    if said.exit_code not in (0, 1, 2) or "Traceback" in said.output or (said.exit_code and not said.output.strip()):
-        yield f"exit {said.exit_code}: {said.output[-300:]}"
+def traceback_in(answer):
+    if answer.exception is not None and not isinstance(answer.exception, SystemExit):
+        yield f"{answer.exception!r}"
+    if (
+        answer.exit_code not in (0, 1, 2)
+        or "Traceback" in answer.output
+        or (answer.exit_code and not answer.output.strip())
+    ):
+        yield f"exit {answer.exit_code}: {answer.output[-300:]}"
 
 
 def listed(stand, state):
-    said = stand.program("session", "list", stand.sessions, "--json")
-    yield from traceback_in(said)
+    answer = stand.program("session", "list", stand.sessions, "--json")
+    yield from traceback_in(answer)
     is_whole = not any(f"/{name}/" in each for name in (TRIPPED, KILLED) for each in state.hit)
-    if said.exit_code == 0 and is_whole and json.loads(said.stdout) != json.loads(stand.listed):
+    if answer.exit_code == 0 and is_whole and json.loads(answer.stdout) != json.loads(stand.listed):
         yield "the list is wrong and nothing says so"
 
 
 def verified(stand, name, hit, state):
     directory = stand.sessions / name
-    said = stand.program("session", "verify", directory, "--json")
-    yield from traceback_in(said)
-    if said.exit_code == 2 or not said.stdout:
+    answer = stand.program("session", "verify", directory, "--json")
+    yield from traceback_in(answer)
+    if answer.exit_code == 2 or not answer.stdout:
         return
-    found = json.loads(said.stdout)["findings"]
+    found = json.loads(answer.stdout)["findings"]
     blamed = {each["where"] for each in found if each["severity"] == "error"} - {""}
     noted = {each["where"] for each in found}
     unfinished = {each for each in blamed if each.endswith(".part")}
@@ -334,8 +338,8 @@ def salvaged(stand, name, hit, state):
     shutil.rmtree(scratch, ignore_errors=True)
     directory = shutil.copytree(stand.sessions / name, scratch / name)
     yield from journalled(stand, name, directory, hit)
-    said = stand.program("session", "repair", directory)
-    yield from traceback_in(said)
+    answer = stand.program("session", "repair", directory)
+    yield from traceback_in(answer)
     for series, true in stand.truth[name].items():
         segments = [Counter(read_segment(path)) for path in sorted((directory / series).glob("*.mcap"))]
         # One of which all but the opening is another's is not told from its own; `verify` says that it is damaged.
@@ -383,7 +387,7 @@ def judge(stand, chosen):
     return tried, found
 
 
-@pytest.mark.parametrize("seeds", [range(BY_DAY), mark_nightly(range(BY_DAY, BY_NIGHT))])
+@pytest.mark.parametrize("seeds", [range(BY_DAY), mark_nightly(range(BY_DAY, NIGHTLY))])
 def test_what_the_disk_has_spoilt_is_named_and_the_rest_is_as_it_was(stand, seeds):
     tried, found = judge(stand, states(stand.before, stand.now, seeds))
     assert found == []

@@ -27,7 +27,7 @@ experiments:
       interval_s: 7
 """
 MEMORY = Path("/dev/shm")  # what others write to a disk would be seen
-ROOM_GB = 0.25
+SPACE_GB = 0.25
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def memory() -> Iterator[Path]:
 async def test_a_disk_that_fills_during_a_capture_holds_it_and_costs_no_frame(
     memory: Path, order: Callable[..., Order]
 ):
-    limit_GB = shutil.disk_usage(memory).free / 1e9 - ROOM_GB
+    limit_GB = shutil.disk_usage(memory).free / 1e9 - SPACE_GB
     ordered = order(RECIPE, recording={"stop_frames_below_GB": limit_GB, "frame_encoding": "zstd"})
     ballast, frames, kinds = memory / "ballast", list[int](), list[str]()
 
@@ -51,7 +51,7 @@ async def test_a_disk_that_fills_during_a_capture_holds_it_and_costs_no_frame(
             frames.append(item.time_ns)
             if len(frames) == 3:
                 with ballast.open("wb") as file:
-                    os.posix_fallocate(file.fileno(), 0, round(2e9 * ROOM_GB))
+                    os.posix_fallocate(file.fileno(), 0, round(2e9 * SPACE_GB))
         if isinstance(item, Event):
             kinds.append(f"{item.kind} {item.data['reason']}" if item.kind in ("held", "released") else item.kind)
             if kinds[-1] == "held disk_low":

@@ -61,9 +61,9 @@ class Daemon:
         """Its exit code, last words and acknowledged frames, and how long it took (s)."""
         begin_s = time.monotonic()
         self._process.send_signal(number)
-        out, said = self._process.communicate(timeout=LIMIT_S)
+        out, output = self._process.communicate(timeout=LIMIT_S)
         last = [line for line in out.splitlines() if line.count("\t") == 4]
-        return self._process.returncode, said, int(last[-1].split("\t")[1]) if last else 0, time.monotonic() - begin_s
+        return self._process.returncode, output, int(last[-1].split("\t")[1]) if last else 0, time.monotonic() - begin_s
 
 
 def lives(pid):
@@ -111,8 +111,8 @@ def recorded(directory):
 def test_a_daemon_on_a_healthy_disk_ends_with_a_whole_session_and_leaves_nothing(tmp_path):
     with Daemon(tmp_path / "s") as daemon:
         daemon.until(lambda frames, messages, age_s, lost: frames >= 20 and messages >= 20)
-        code, said, frames, _ = daemon.end(signal.SIGTERM)
-        assert (code, said) == (0, "")
+        code, output, frames, _ = daemon.end(signal.SIGTERM)
+        assert (code, output) == (0, "")
         gone(daemon.disk_pid)
         assert not Session.open(tmp_path / "s").incomplete
         assert isinstance(entries(tmp_path / "s")[-1], Ended)
@@ -137,10 +137,10 @@ def test_a_daemon_whose_disk_hangs_leaves_and_its_disk_process_ends_with_the_han
         daemon.until(lambda frames, messages, age_s, lost: frames >= 10)
         with frozen(disk):
             daemon.until(lambda frames, messages, age_s, lost: age_s > 0.5)
-            code, said, frames, took_s = daemon.end(number)
+            code, output, frames, took_s = daemon.end(number)
             if number == signal.SIGTERM:
                 assert code == 3
-                assert "session is unfinished" in said
+                assert "session is unfinished" in output
             else:
                 assert code == -signal.SIGKILL
             assert took_s < 5 + 10  # 5 s; the machine may have other things to do
@@ -162,9 +162,9 @@ def test_a_disk_process_that_was_killed_is_a_refusal_and_the_daemon_says_so(tmp_
         daemon.until(lambda frames, messages, age_s, lost: frames >= 10)
         os.kill(daemon.disk_pid, signal.SIGKILL)
         daemon.until(lambda frames, messages, age_s, lost: age_s > 0.5)
-        code, said, frames, _ = daemon.end(signal.SIGTERM)
+        code, output, frames, _ = daemon.end(signal.SIGTERM)
         assert code == 3
-        assert "process that writes" in said
+        assert "process that writes" in output
         check(tmp_path / "s", frames)
 
 
@@ -177,8 +177,8 @@ def test_a_folder_that_was_renamed_under_a_daemon_is_seen_within_a_commit(tmp_pa
         (tmp_path / "t").rename(tmp_path / "s")
         frames, *_ = daemon.until(lambda frames, messages, age_s, lost: not lost and age_s < 0.2)
         daemon.until(lambda more, messages, age_s, lost: more > frames)
-        code, said, frames, _ = daemon.end(signal.SIGTERM)
-        assert (code, said) == (0, "")
+        code, output, frames, _ = daemon.end(signal.SIGTERM)
+        assert (code, output) == (0, "")
         blocks, lost = recorded(tmp_path / "s")
         # On a busy machine the folder is away for longer than the queue of frames has room for.
         assert sorted([*blocks, *lost]) == list(range(len(blocks) + len(lost)))

@@ -106,7 +106,7 @@ def test_a_command_in_the_text_exists_with_its_options(page: Path):
 def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The packages of docs/examples, installed, in an empty folder with the files that pages name."""
     monkeypatch.syspath_prepend(tmp_path / "site")
-    for folder in ("lamp", "room-rule"):
+    for folder in ("lamp", "ambient-rule"):
         project = tomllib.loads((EXAMPLES / folder / "pyproject.toml").read_text("utf-8"))["project"]
         modules = {path.stem: path.read_text("utf-8") for path in (EXAMPLES / folder).glob("*.py")}
         points = {
@@ -117,8 +117,8 @@ def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     (tmp_path / "my-camera.xml").write_text("<RegisterDescription/>")
     monkeypatch.chdir(tmp_path)
     yield
-    KINDS.pop(f"{GUARD}room_hot", None)
-    for module in ("acme_lamp", "acme_fake", "acme_room"):
+    KINDS.pop(f"{GUARD}ambient_hot", None)
+    for module in ("acme_lamp", "acme_fake", "acme_ambient"):
         sys.modules.pop(module, None)
 
 

@@ -1,4 +1,4 @@
-"""The drift models on whole recorded nights of the simulated stand, against its noise-free truth.
+"""The drift models on whole recorded sessions of the simulated stand, against its noise-free truth.
 
 `pytest -m nightly -s` prints the figures.
 """
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.nightly
 
 Seen = tuple[Observations, NDArray[np.float64]]
 
-NIGHT = """
+RECIPE = """
 name: night
 experiments:
   - warm_up: {table_position: {linear: 0, rotary: 0}, cool_down_max_s: 5400, frames: 60, interval_s: 30}
@@ -53,14 +53,15 @@ experiments:
 # RMS of both coordinates, mpx. Measured for the modified camera: 1.7 at held-out temperatures, 3.3 and 6.7 in the
 # warm-ups at 15 and 34 degC.
 HELD_OUT_MPX = {"modified": 5.0, "unmodified": 15.0}
-# The goal in warm-ups is 3 mpx, and it is missed. This is one night of one camera, on which the form before had left
-# 1.8 and 3.5; over four nights (`python -m tests.bench drift`) it had left 10.4 and 4.5 where this one leaves 6.1 and
-# 5.3. So the bounds here say that a recorded night comes to what the form can do, and the bench whether that is enough.
+# The goal in warm-ups is 3 mpx, and it is missed. This is one session of one camera, on which the form before had left
+# 1.8 and 3.5; over four sessions (`python -m tests.bench drift`) it had left 10.4 and 4.5 where this one leaves 6.1 and
+# 5.3. So the bounds here say that a recorded session comes to what the form can do, and the bench whether that is
+# enough.
 WARM_UP_MPX = {15.0: 6.0, 34.0: 8.0}
 OF_PAPERS_FORM = 0.2  # at most so much of what the paper's form leaves
 # What the model and the markers claim, over what is left, RMS. No upper limit of the coverage: three temperatures of
-# one camera share their errors, so of intervals that are right most nights hold more than 98 %, and some far fewer than
-# 92. Measured: 1.5 and 1.4, with 99.7 and 99.6 % held. `make bench` shows the coverage over many cameras.
+# one camera share their errors, so of intervals that are right most sessions hold more than 98 %, and some far fewer
+# than 92. Measured: 1.5 and 1.4, with 99.7 and 99.6 % held. `make bench` shows the coverage over many cameras.
 WIDEST = 2.0
 
 
@@ -95,17 +96,17 @@ def left_mpx(model: DriftModel, seen: Seen, role: Role, reference_px: NDArray[np
 async def test_the_modified_camera_is_compensated_at_unseen_temperatures_and_in_unseen_warm_ups(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    night = await record(order(NIGHT), tmp_path / "night")
-    reference_px = night[1][night[0].of(Role.REFERENCE)].mean(axis=0)
-    model = fit(night[0])
+    session = await record(order(RECIPE), tmp_path / "cycle")
+    reference_px = session[1][session[0].of(Role.REFERENCE)].mean(axis=0)
+    model = fit(session[0])
     assert model.form == "thermal"
-    paper = fit(night[0], form="paper")
-    asked = [(night, Role.VALIDATION, HELD_OUT_MPX["modified"])]
+    paper = fit(session[0], form="paper")
+    asked = [(session, Role.VALIDATION, HELD_OUT_MPX["modified"])]
     for air_degC, most_mpx in WARM_UP_MPX.items():
         elsewhere = await record(order(WARM_UP % air_degC), tmp_path / f"{air_degC:g}")
         asked.append((elsewhere, Role.WARM_UP, most_mpx))
     left = [[left_mpx(form, seen, role, reference_px) for form in (model, paper)] for seen, role, _ in asked]
-    found = evaluate(model, night[0])
+    found = evaluate(model, session[0])
     width = np.sqrt(np.mean(found.claimed_px2, axis=0) / np.mean(found.after_px**2, axis=0))
     print(left, found.coverage_95, width)  # noqa: T201
     for (own_mpx, papers_mpx), (*_, most_mpx) in zip(left, asked, strict=True):
@@ -115,10 +116,10 @@ async def test_the_modified_camera_is_compensated_at_unseen_temperatures_and_in_
 
 
 async def test_the_unmodified_camera_is_compensated_at_unseen_temperatures(tmp_path: Path, order: Callable[..., Order]):
-    night = await record(order(NIGHT, simulation={"camera": "unmodified"}), tmp_path / "night")
-    reference_px = night[1][night[0].of(Role.REFERENCE)].mean(axis=0)
-    model = fit(night[0])
+    session = await record(order(RECIPE, simulation={"camera": "unmodified"}), tmp_path / "cycle")
+    reference_px = session[1][session[0].of(Role.REFERENCE)].mean(axis=0)
+    model = fit(session[0])
     assert model.form == "thermal"
-    own_mpx = left_mpx(model, night, Role.VALIDATION, reference_px)
+    own_mpx = left_mpx(model, session, Role.VALIDATION, reference_px)
     print(own_mpx)  # noqa: T201
     assert own_mpx <= HELD_OUT_MPX["unmodified"]

@@ -129,7 +129,7 @@ async def test_the_time_left_of_dwells_that_end_when_settled_is_true_once_a_run_
 
 
 @pytest.mark.nightly
-async def test_the_time_left_is_true_over_the_whole_demo_night(tmp_path: Path, order: Callable[..., Order]):
+async def test_the_time_left_is_true_over_the_whole_demo_session(tmp_path: Path, order: Callable[..., Order]):
     session, left = await followed(order(find_packaged("recipes", "demo").read_text(), camera=CORNER), tmp_path)
     assert len(left) > 10_000
     assert worst_share(left, session) < 0.05

@@ -28,7 +28,7 @@ def bad_polls_ns(session: Session, channel: str, cause: str) -> list[int]:
 
 
 @pytest.mark.parametrize(("name", "value", "wire"), [("bus.garbled", 3, "tcp"), ("bus.late_s", 1.0, "serial")])
-async def test_a_poll_that_fails_on_the_wire_is_asked_again_and_ends_no_night(
+async def test_a_poll_that_fails_on_the_wire_is_asked_again_and_ends_no_session(
     tmp_path: Path, order: Callable[..., Order], name: str, value: object, wire: str
 ):
     """Three garbled replies are one poll with all its repeats; a reply 20 time-outs late spoils the repeats as well."""

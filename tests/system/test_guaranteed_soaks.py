@@ -137,7 +137,7 @@ async def test_a_run_that_is_interrupted_while_a_soak_goes_on_ends_it_in_the_ban
     assert [meta.flags for meta in session.frame_metas()] == [(), ()]
 
 
-async def test_a_soak_that_may_not_end_unsettled_holds_the_run_and_begins_anew_when_cleared(
+async def test_a_soak_that_may_not_end_unsettled_holds_the_run_and_begins_again_when_cleared(
     tmp_path: Path, order: Callable[..., Order]
 ):
     """Twice too short; the operator gives the chamber time before the third."""

@@ -115,15 +115,15 @@ async def test_the_guard_looks_on_and_a_stop_leaves_while_everything_hangs(
                     left_ns = clock.now_ns()
                 finally:
                     run("fsfreeze", "-u", disk)
-            said = process.stderr.read()
+            output = process.stderr.read()
         finally:
             process.kill()
             process.wait(LIMIT_S)
             process.stderr.close()
-    assert status == 130, said
-    assert "stopped by the operator" in said
-    assert "limit 60 s" in said
-    assert "guard has not looked" not in said  # what is reported when two looks are more than two periods apart
+    assert status == 130, output
+    assert "stopped by the operator" in output
+    assert "limit 60 s" in output
+    assert "guard has not looked" not in output  # what is reported when two looks are more than two periods apart
     assert sum(answers) > CLIENTS
     assert (safe_ns - begun_ns) / NS_PER_S < 15.0
     assert (left_ns - safe_ns) / NS_PER_S < 15.0  # 5 s where nothing else keeps the machine busy

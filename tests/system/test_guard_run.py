@@ -138,9 +138,9 @@ async def test_a_fault_of_the_heat_or_its_sensors_ends_the_run_and_only_an_opera
     await asyncio.gather(*tasks)
     (directory,) = (tmp_path / "out").iterdir()
     session = Session.open(directory)
-    said = [event for event in session.events() if event.kind.startswith("guard.")]
-    (trip,) = [event for event in said if event.data["action"] != "warn"]
-    assert {event.kind for event in said} - {trip.kind} <= {"guard.sensor_jumped"}
+    guarded = [event for event in session.events() if event.kind.startswith("guard.")]
+    (trip,) = [event for event in guarded if event.data["action"] != "warn"]
+    assert {event.kind for event in guarded} - {trip.kind} <= {"guard.sensor_jumped"}
     assert (trip.level, trip.kind) == ("error", f"guard.{rule}")
     assert text in trip.text
     assert str(caught.value) == f"{trip.text}; the stand is safe"
@@ -232,9 +232,7 @@ async def test_what_an_operator_can_put_right_holds_the_run_until_one_clears_it(
     assert trips_of(directory).count("reset") == len(trips)
 
 
-async def test_a_disk_without_room_trips_after_its_time_and_clearing_makes_no_room(
-    tmp_path: Path, order: Callable[..., Order]
-):
+async def test_a_full_disk_trips_after_its_time_and_a_reset_frees_no_space(tmp_path: Path, order: Callable[..., Order]):
     ordered, watcher, out = order(LONG_SOAK), Watcher(), tmp_path / "out"
     recording = ordered.config.recording.model_copy(update={"stop_frames_below_GB": 1e9})
     ordered = replace(ordered, config=ordered.config.model_copy(update={"recording": recording}))

@@ -356,14 +356,14 @@ async def test_a_daemon_whose_event_loop_is_held_up_does_not_heat(order: Callabl
         await bench.make_safe()
 
 
-NIGHTS = [
+SESSIONS = [
     pytest.param(SHORT_RECIPE.replace("600", "300"), id="short"),
     pytest.param(find_packaged("recipes", "demo").read_text(), id="demo", marks=pytest.mark.nightly),
 ]
 
 
-@pytest.mark.parametrize("recipe", NIGHTS)
-async def test_a_good_night_trips_nothing_and_warns_of_nothing(
+@pytest.mark.parametrize("recipe", SESSIONS)
+async def test_a_good_session_trips_nothing_and_warns_of_nothing(
     tmp_path: Path, order: Callable[..., Order], recipe: str
 ):
     """As the guard of the run saw it, and the recording of it once more, asked every 5 s."""

@@ -45,7 +45,7 @@ def test_devices_are_operated_by_hand_and_left_safe(tell: Callable[..., Result],
     assert (state["flap_open"], state["camera_powered"]) == (pytest.approx(0, abs=0.05), 0)
 
 
-def test_what_is_not_done_by_hand_is_said(tell: Callable[..., Result]):
+def test_what_is_not_done_by_hand_is_reported(tell: Callable[..., Result]):
     for words, sentence in (
         (("regulator", "set", "setpoint_degC=30"), "heat needs a recording and a guard"),
         (("linear", "move", "position=500"), "outside the limits"),

@@ -22,7 +22,7 @@ from thermostand.stand.running.order import Order
 
 POLLED = AS_INSTALLED
 
-TESTS, ROOM = Path(__file__).parents[1], Path(stand.__file__).parent
+TESTS, STAND = Path(__file__).parents[1], Path(stand.__file__).parent
 PHASES_S = (0.0, 1.5, 3.5)  # between the fault and the polls, which come each 5 s
 _LOOK_S = 0.5
 _PLACES = {"Fault": 0, "_ErrorRule": 2}
@@ -32,7 +32,7 @@ _APART_S = 1.0  # virtual time repeats; two looks are for another order of what 
 
 def rules_of_the_guard() -> Iterator[str]:
     """The names that faults are given anywhere in `stand`; of a class they are those of its subject."""
-    for path in ROOM.rglob("*.py"):
+    for path in STAND.rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text())):
             place = (
                 _PLACES.get(call.func.id) if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) else None
@@ -44,7 +44,7 @@ def rules_of_the_guard() -> Iterator[str]:
                 yield str(rule.value)
             elif isinstance(rule, ast.Name):
                 module = importlib.import_module(
-                    ".".join(("thermostand", *path.relative_to(ROOM.parent).with_suffix("").parts))
+                    ".".join(("thermostand", *path.relative_to(STAND.parent).with_suffix("").parts))
                 )
                 yield getattr(module, rule.id)
 
@@ -105,7 +105,7 @@ async def test_what_is_measured_is_what_the_document_says(
     async with bench_of(order(), simulator) as bench:
         found = await measured_s(bench, trial, phase_s)
     known: dict[str, dict[str, list[float]]] = json.loads(MEASURED.read_text())
-    told = known.get(trial.name, {}).get(str(phase_s), [math.nan, math.nan])
+    known_s = known.get(trial.name, {}).get(str(phase_s), [math.nan, math.nan])
     measured = json.dumps({trial.name: {phase_s: found}})
-    assert found[0] == pytest.approx(told[0], abs=_APART_S), measured
-    assert found[1] == pytest.approx(told[1], abs=_APART_S), measured
+    assert found[0] == pytest.approx(known_s[0], abs=_APART_S), measured
+    assert found[1] == pytest.approx(known_s[1], abs=_APART_S), measured

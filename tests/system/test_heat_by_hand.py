@@ -1,4 +1,5 @@
-"""Heat that an operator orders between runs: it goes on over midnight, and is told while the regulator is not read."""
+"""Heat that an operator orders between runs: it goes on over midnight, and is reported while the regulator is not
+read."""
 
 import socket
 from contextlib import suppress
@@ -22,16 +23,16 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
     day = ["20261122"]
     monkeypatch.setattr(IdleLog, "_get_today", lambda _: day[0])
     reported: list[Event] = []
-    told: list[bytes] = []  # to the service manager
+    sent: list[bytes] = []  # to the service manager
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
     manager.bind(str(tmp_path / "notify"))
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
 
-    def is_told(line: bytes) -> bool:
+    def is_sent(line: bytes) -> bool:
         with suppress(BlockingIOError):
             while True:
-                told.extend(manager.recv(1000).splitlines())
-        return told[-1:] == [line]
+                sent.extend(manager.recv(1000).splitlines())
+        return sent[-1:] == [line]
 
     async def work(here: DaemonHere) -> None:
         desk, hub, clock, daemon = here.desk, here.hub, here.clock, here.daemon
@@ -50,9 +51,9 @@ async def test_midnight_changes_the_record_beneath_heat_by_hand(
         await until(lambda: desk.state().setpoint_degC == 40.0)
         assert desk.state().by_hand == by_hand is not None
         assert daemon.open_stand.recorder is daemon.record.recorder
-        await until(lambda: is_told(b"STATUS=heat by hand, set-point 40 degC"))
+        await until(lambda: is_sent(b"STATUS=heat by hand, set-point 40 degC"))
         desk.stop(who)
-        await until(lambda: is_told(b"STATUS=idle"))
+        await until(lambda: is_sent(b"STATUS=idle"))
 
     with manager:
         await served_here(laboratory, out, work)

@@ -120,7 +120,7 @@ class Host:
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            self.said = process.communicate(timeout=LIMIT_S)[1]
+            self.output = process.communicate(timeout=LIMIT_S)[1]
 
     def session(self) -> Path:
         return next(self._out.glob("*-cold"))

@@ -15,7 +15,7 @@ HEAVY = ("numba", "scipy", "cv2", "matplotlib")
 STAGES = {
     "stand --help": "from thermostand.stand.cli import app; help_of(app, 'stand')",
     "compensate --help": "from thermostand.compensation.cli import app; help_of(app, 'compensate')",
-    "rooms": "from thermostand import compensation, experiments, foundation, markers, recording, stand",
+    "folders": "from thermostand import compensation, experiments, foundation, markers, recording, stand",
     "session": "from thermostand.recording import Session; s = Session.open(sys.argv[1]); "
     "s.channels(); s.frames_table(); s.holes",
     "frame": "s.frame(0)",
@@ -45,15 +45,15 @@ def load(recipe):
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Which of the heavy libraries a new interpreter has loaded after each stage."""
-    night = asyncio.run(record_run(tmp_path_factory.mktemp("sessions") / "night"))
+    session = asyncio.run(record_run(tmp_path_factory.mktemp("sessions") / "cycle"))
     tell = f"print('loaded', *({{*{HEAVY}}} & {{*sys.modules}}), file=sys.stderr)"
     code = BEGIN + "".join(f"{stage}\n{tell}\n" for stage in STAGES.values())
-    done = subprocess.run([sys.executable, "-c", code, str(night)], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code, str(session)], capture_output=True, text=True, check=True)
     lines = [line.split()[1:] for line in done.stderr.splitlines() if line.startswith("loaded")]
     return dict(zip(STAGES, map(set, lines), strict=True))
 
 
-@pytest.mark.parametrize("stage", ["stand --help", "compensate --help", "rooms", "session", "frame"])
+@pytest.mark.parametrize("stage", ["stand --help", "compensate --help", "folders", "session", "frame"])
 def test_help_packages_and_the_reading_of_a_session_load_no_heavy_library(loaded: dict[str, set[str]], stage: str):
     assert loaded[stage] == set()
 

@@ -39,7 +39,7 @@ def stand(folder: Path, action: str, unit: int, *faults: str, **changes: object)
     return folder / "stand.yaml"
 
 
-async def night(folder: Path, config: Path) -> tuple[Session, list[Event], str]:
+async def run_session(folder: Path, config: Path) -> tuple[Session, list[Event], str]:
     """The session, its events, and how the run ended."""
     seen: list[Event] = []
     order = load_order(str(folder / "rest.yaml"), str(config))
@@ -62,7 +62,7 @@ async def night(folder: Path, config: Path) -> tuple[Session, list[Event], str]:
 
 @pytest.mark.parametrize("unit", [2, 7])
 async def test_an_open_door_ends_the_run_where_it_is_to_trip(tmp_path: Path, unit: int):
-    session, seen, ended = await night(tmp_path, stand(tmp_path, "trip", unit, "inputs.changed=door@100"))
+    session, seen, ended = await run_session(tmp_path, stand(tmp_path, "trip", unit, "inputs.changed=door@100"))
     assert ended.startswith(StandTripped.__name__)
     (trip,) = (event for event in seen if event.kind == "guard.contact")
     assert (trip.text.partition(":")[0], trip.data["action"]) == ("inputs.door is open", "abort")
@@ -74,7 +74,7 @@ async def test_an_open_door_ends_the_run_where_it_is_to_trip(tmp_path: Path, uni
 
 
 async def test_a_contact_that_only_warns_leaves_the_run_alone(tmp_path: Path):
-    _, seen, ended = await night(tmp_path, stand(tmp_path, "trip", 2, "inputs.changed=key@100:60"))
+    _, seen, ended = await run_session(tmp_path, stand(tmp_path, "trip", 2, "inputs.changed=key@100:60"))
     assert ended == "complete"
     (warned,) = (event for event in seen if event.kind == "guard.contact")
     assert (warned.level, warned.text) == ("warning", "inputs.key is closed")
@@ -82,7 +82,7 @@ async def test_a_contact_that_only_warns_leaves_the_run_alone(tmp_path: Path):
 
 async def test_a_door_that_is_opened_for_less_than_it_may_is_nothing(tmp_path: Path):
     config = stand(tmp_path, "trip", 2, "inputs.changed=door@100:10", after_s=30)
-    _, seen, ended = await night(tmp_path, config)
+    _, seen, ended = await run_session(tmp_path, config)
     assert (ended, [event for event in seen if event.kind == "guard.contact"]) == ("complete", [])
 
 

@@ -1,5 +1,5 @@
 """A thermal cycle that decides, over every wire in virtual time: the drift model is fitted in its own process from what
-the night has recorded so far."""
+the session has recorded so far."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -35,7 +35,7 @@ experiments:
 """
 
 
-async def test_a_night_decides_from_what_it_has_recorded_and_the_same_from_the_same(
+async def test_a_session_decides_from_what_it_has_recorded_and_the_same_from_the_same(
     tmp_path: Path, order: Callable[..., Order]
 ):
     """The first visits go where nothing is known yet, and later ones by the fitted model; it is never content."""

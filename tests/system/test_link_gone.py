@@ -54,10 +54,10 @@ class Cut:
         return follow
 
     async def trying(self, times: int) -> None:
-        """Return when it has been said so often that the stand is not safe."""
-        await self.watcher.until(lambda: len(self.said()) >= times)
+        """Return when it has been reported so often that the stand is not safe."""
+        await self.watcher.until(lambda: len(self.reports()) >= times)
 
-    def said(self) -> list[Event]:
+    def reports(self) -> list[Event]:
         return [event for event in self.watcher.events if event.data.get("unconfirmed") and "still" in event.text]
 
 
@@ -78,10 +78,10 @@ async def test_it_is_made_safe_when_the_link_is_back(tmp_path: Path, order: Call
     await asyncio.gather(*cut.tasks)
     session = Session.open(next((tmp_path / "out").iterdir()))
     check_safe(session)
-    first_s, second_s = (event.time_ns / NS_PER_S for event in cut.said())
+    first_s, second_s = (event.time_ns / NS_PER_S for event in cut.reports())
     assert second_s - first_s == pytest.approx(120, abs=2)
     for device in ("relays", "regulator"):
-        assert all(f"{device} did not confirm" in event.text for event in cut.said())
+        assert all(f"{device} did not confirm" in event.text for event in cut.reports())
     assert "confirmed_safe" in [event.kind for event in session.events()]
 
 
@@ -105,7 +105,7 @@ async def test_a_second_signal_a_minute_later_ends_the_wait_and_earlier_ones_do_
     session = Session.open(next((tmp_path / "out").iterdir()))
     begun = next(mark for mark in session.steps() if mark.kind == "soak")
     assert 60 <= (session.events()[-1].time_ns - begun.time_ns) / NS_PER_S < 90
-    assert len(cut.said()) == 1
+    assert len(cut.reports()) == 1
 
 
 async def test_without_an_operator_the_wait_ends_at_its_limit(tmp_path: Path, order: Callable[..., Order]):
@@ -121,7 +121,7 @@ async def test_without_an_operator_the_wait_ends_at_its_limit(tmp_path: Path, or
     trip = next(event for event in session.events() if event.kind.startswith("guard."))
     last_ns = max(item.time_ns for item in session.items())
     assert 130 <= (last_ns - trip.time_ns) / NS_PER_S < 160
-    assert len(cut.said()) >= 2
+    assert len(cut.reports()) >= 2
 
 
 async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_second_signal_ends_it(
@@ -190,11 +190,11 @@ async def test_as_a_command_in_real_time_it_ends_with_that_word_and_its_exit_cod
             assert process.poll() is None
             process.send_signal(signal.SIGINT)
         assert await asyncio.to_thread(process.wait, LIMIT_S) == 130
-        said = process.stderr.read()
+        reports = process.stderr.read()
     finally:
         process.kill()
         process.wait(LIMIT_S)
         process.stderr.close()
-    assert f"stopped by the operator; {ending}" in said.splitlines()[-1]
-    assert ("still trying: re" in said) is not comes_back
+    assert f"stopped by the operator; {ending}" in reports.splitlines()[-1]
+    assert ("still trying: re" in reports) is not comes_back
     assert await plant(ordered, "heater_enabled") == 0

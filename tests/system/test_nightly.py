@@ -1,4 +1,4 @@
-"""The demo's whole night, in virtual time: the same twice, and what compensation gains with either camera."""
+"""The demo's whole session, in virtual time: the same twice, and what compensation gains with either camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BEFORE_PX = (0.31, 0.88)
 AFTER_PX = (0.02, 0.1)
 
 
-async def night(ordered: Order, out: Path) -> Path:
+async def run_session(ordered: Order, out: Path) -> Path:
     return await run_virtual(ordered, out, None, lambda _: None)
 
 
@@ -41,8 +41,8 @@ def digests(session: Path) -> dict[str, str]:
 
 async def test_the_demo_is_the_same_twice_and_compensation_gains(tmp_path: Path, order: Callable[..., Order]):
     ordered = order(find_packaged("recipes", "demo").read_text())
-    first = await night(ordered, tmp_path / "first")
-    second = await night(ordered, tmp_path / "second")
+    first = await run_session(ordered, tmp_path / "first")
+    second = await run_session(ordered, tmp_path / "second")
     assert len(digests(first)) >= 2
     assert digests(first) == digests(second)
     evaluation = score(first)
@@ -54,7 +54,7 @@ async def test_the_demo_is_the_same_twice_and_compensation_gains(tmp_path: Path,
 
 async def test_the_unmodified_camera_drifts_more_and_is_compensated_too(tmp_path: Path, order: Callable[..., Order]):
     ordered = order(find_packaged("recipes", "demo").read_text(), simulation={"camera": "unmodified"})
-    evaluation = score(await night(ordered, tmp_path / "out"))
+    evaluation = score(await run_session(ordered, tmp_path / "out"))
     for axis in (0, 1):
         assert evaluation.rms_before_px[axis] > BEFORE_PX[axis]
         assert evaluation.rms_after_px[axis] <= AFTER_PX[1]

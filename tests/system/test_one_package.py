@@ -9,7 +9,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("compensation", "configs", "drivers", "experiments", "foundation", "markers", "recording", "stand")
+FOLDERS = ("compensation", "configs", "drivers", "experiments", "foundation", "markers", "recording", "stand")
 # What is not installed here (ROS 2) may be missing; that a room is missing may not.
 EVERYTHING = """
 import importlib, pkgutil, thermostand
@@ -35,23 +35,23 @@ for app, line in ((stand, "stand recipes"), (stand, "stand plan demo"), (compens
 """
 
 
-def test_each_room_is_linked_into_the_package():
+def test_each_folder_is_linked_into_the_package():
     linked = {path.name for path in (ROOT / "thermostand").iterdir() if path.is_symlink()}
-    assert linked == set(ROOMS)
-    assert all((ROOT / "thermostand" / room).resolve() == ROOT / room for room in ROOMS)
+    assert linked == set(FOLDERS)
+    assert all((ROOT / "thermostand" / folder).resolve() == ROOT / folder for folder in FOLDERS)
 
 
-def test_files_of_the_same_names_beside_a_notebook_are_not_imported(tmp_path: Path):
-    for room in ROOMS:
-        (tmp_path / f"{room}.py").write_text("raise SystemExit('a stranger was imported')\n")
-    tail = f"\nimport sys; sys.stderr.write('bare ' + ' '.join({{*{ROOMS}}} & {{*sys.modules}}))"
+def test_files_of_the_same_names_in_a_notebooks_folder_are_not_imported(tmp_path: Path):
+    for folder in FOLDERS:
+        (tmp_path / f"{folder}.py").write_text("raise SystemExit('a stranger was imported')\n")
+    tail = f"\nimport sys; sys.stderr.write('bare ' + ' '.join({{*{FOLDERS}}} & {{*sys.modules}}))"
     done = subprocess.run(
         [sys.executable, "-c", PROGRAMS + EVERYTHING + tail], cwd=tmp_path, capture_output=True, text=True
     )
     assert (done.returncode, done.stderr.splitlines()[-1:]) == (0, ["bare "]), done.stderr
 
 
-def test_a_wheel_built_of_the_source_package_holds_all_rooms_and_no_other_name(tmp_path: Path):
+def test_a_wheel_built_of_the_source_package_holds_all_folders_and_no_other_name(tmp_path: Path):
     build = "import hatchling.build as build, sys; print(getattr(build, sys.argv[1])(sys.argv[2]))"
     options = {"cwd": ROOT, "capture_output": True, "text": True, "check": True}
     subprocess.run([sys.executable, "-c", build, "build_sdist", str(tmp_path)], **options)
@@ -64,6 +64,6 @@ def test_a_wheel_built_of_the_source_package_holds_all_rooms_and_no_other_name(t
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.partition("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"thermostand"}
-    tracked = subprocess.run(["git", "ls-files", *ROOMS], cwd=ROOT, capture_output=True, text=True, check=True)
+    tracked = subprocess.run(["git", "ls-files", *FOLDERS], cwd=ROOT, capture_output=True, text=True, check=True)
     missing = {f"thermostand/{name}" for name in tracked.stdout.split("\n") if name} - set(names)
     assert missing == set()

@@ -45,7 +45,7 @@ async def press(out: Path, run: asyncio.Task[Path], seed: int, news: asyncio.Eve
     return answers
 
 
-async def test_a_night_with_two_restless_operators_is_whole(tmp_path: Path, order: Callable[..., Order]):
+async def test_a_session_with_two_restless_operators_is_whole(tmp_path: Path, order: Callable[..., Order]):
     ordered, out = order(ONE_SET_POINT), tmp_path / "out"
     news = asyncio.Event(), asyncio.Event()  # virtual time stands still as long as somebody has something to do
 

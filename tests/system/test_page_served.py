@@ -55,7 +55,7 @@ async def until(served, wanted):
     return await asyncio.to_thread(served.until, wanted)
 
 
-async def test_a_night_is_begun_watched_paused_and_stopped_in_a_browser(served_page):
+async def test_a_session_is_begun_watched_paused_and_stopped_in_a_browser(served_page):
     """And the daemon ends and comes again under the open page."""
     served, port = served_page()
     await until(served, lambda state: state.phase == "idle" and len(state.readings) > 10)

@@ -22,7 +22,7 @@ from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
-NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
+RECIPE = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "frames_per_point: 6")
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def executors(monkeypatch: pytest.MonkeyPatch) -> list[Executor]:
 async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_stop(
     tmp_path: Path, order: Callable[..., Order], executors: list[Executor]
 ):
-    ordered, out, tasks = order(NIGHT), tmp_path / "out", list[asyncio.Task[None]]()
+    ordered, out, tasks = order(RECIPE), tmp_path / "out", list[asyncio.Task[None]]()
     plan = tuple(ordered.recipe.plan())
     soak, other = [planned for planned in plan if isinstance(planned.step, Soak)][:2]
     first, second = [planned for planned in plan if isinstance(planned.step, Capture)][:2]
@@ -79,7 +79,7 @@ async def test_a_plan_that_was_changed_is_recorded_and_goes_on_changed_after_a_s
     session = Session.open(directory)
     found = verify(directory)
     assert (found.run, found.files) == (RunOutcome.COMPLETE, Files.SOUND), found.findings
-    assert session.attachments["recipe.yaml"] == NIGHT
+    assert session.attachments["recipe.yaml"] == RECIPE
     assert [event.data["change"] for event in session.events() if event.kind == "plan_changed"] == [
         "Skipped",
         "Extended",

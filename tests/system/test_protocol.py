@@ -10,9 +10,9 @@ from tests.system.simulated_orders import simulated_order
 
 
 @pytest.mark.nightly
-def test_two_whole_nights_are_the_same_to_the_byte_and_leave_nothing_in_memory(tmp_path: Path):
+def test_two_whole_sessions_are_the_same_to_the_byte_and_leave_nothing_in_memory(tmp_path: Path):
     require_aravis()
-    nights = outcomes(simulated_order(tmp_path, PROTOCOL, POLL_s), tmp_path, 2)
-    assert len({night.digest for night in nights}) == 1
-    assert all(night.simulated_s > 15.5 * 3600 for night in nights)
-    assert max(night.end_MB - night.settled_MB for night in nights) < GROWTH_LIMIT_MB
+    outcomes_of_two = outcomes(simulated_order(tmp_path, PROTOCOL, POLL_s), tmp_path, 2)
+    assert len({outcome.digest for outcome in outcomes_of_two}) == 1
+    assert all(outcome.simulated_s > 15.5 * 3600 for outcome in outcomes_of_two)
+    assert max(outcome.end_MB - outcome.settled_MB for outcome in outcomes_of_two) < GROWTH_LIMIT_MB

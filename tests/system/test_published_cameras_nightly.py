@@ -1,4 +1,4 @@
-"""Nights of the simulated laboratory with each camera of configs/optics, through every wire: recorded to the end, and
+"""Sessions of the simulated laboratory with each camera of configs/optics, through every wire: recorded to the end, and
 the image grows or shrinks as its file says."""
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def recorded(optics: str, out: Path) -> Observations:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(("optics", "grows"), [("nac", True), ("navcam", False), ("dic", True), ("phone", True)])
-def test_a_night_with_each_of_them_is_recorded_and_its_image_goes_as_its_file_says(
+def test_a_session_with_each_of_them_is_recorded_and_its_image_goes_as_its_file_says(
     tmp_path: Path, optics: str, grows: bool
 ):
     require_aravis()

@@ -35,7 +35,7 @@ RUN = (
 """Pages whose commands are typed one after the other, by night."""
 NOT_RUN = ("make ", "stand run calibration", "stand session replay sessions/NAME --speed 60", "--like", "calibrate-rig")
 """They set up, need a real stand, take real time, or need sessions of several units: tests of their own do that."""
-LIMIT_S = 3600.0  # for a whole night in virtual time on a busy machine
+LIMIT_S = 3600.0  # for a whole session in virtual time on a busy machine
 
 
 def test_the_readme_has_its_three_more():
@@ -117,15 +117,15 @@ def test_every_command_of_the_tutorial_runs_in_an_empty_folder(tmp_path: Path):
     (tmp_path / ".venv").symlink_to(sys.prefix)
     (tmp_path / "points.csv").write_text("x_px,y_px\n1200,1000\n")
     (tmp_path / "details.yaml").write_text("lens: 25 mm f/1.4\n")
-    (tmp_path / "night.yaml").write_text(VALIDATION)
-    night = run(".venv/bin/stand run night.yaml --virtual-time --out nights", tmp_path).strip()
+    (tmp_path / "cycle.yaml").write_text(VALIDATION)
+    session = run(".venv/bin/stand run night.yaml --virtual-time --out nights", tmp_path).strip()
     run(".venv/bin/stand demo", tmp_path)
     printed: dict[str, str] = {}
     for command in typed():
         recorded = next(tmp_path.glob("sessions/*-demo"), Path("none"))
         words = {
             "SESSION-1 SESSION-2": f"sessions/{recorded.name}",
-            "sessions/(?:CALIBRATION|VALIDATION)": night,
+            "sessions/(?:CALIBRATION|VALIDATION)": session,
             "sessions/(?:NAME|LATER)": f"sessions/{recorded.name}",
             r"photos/left-01.png photos/left-02.png": f"{photographs}/*.png",
         }

@@ -111,16 +111,16 @@ async def test_a_run_by_itself_has_the_page_and_secop_of_its_file_and_either_sto
     shown = RunFollower(moments.append, lines.append, out)
     front = shown.make_front(make_interface(config, out), ordered.target_text)
     run = asyncio.create_task(run_real(ordered, out, shown.watch, front=front))
-    there = make_server(f"http://127.0.0.1:{ports.port}")
+    server = make_server(f"http://127.0.0.1:{ports.port}")
     async with asyncio.timeout(60.0):
         while not moments:
             await asyncio.sleep(0.1)
-    state = await asyncio.to_thread(there.state, 30.0)
+    state = await asyncio.to_thread(server.state, 30.0)
     assert [(each.recipe, each.state) for each in state.queue] == [("brief", "running")]
-    devices = cast("list[dict[str, str]]", await asyncio.to_thread(there.request, "GET", f"{API}/devices", None, 30.0))
+    devices = cast("list[dict[str, str]]", await asyncio.to_thread(server.request, "GET", f"{API}/devices", None, 30.0))
     assert all(each["refused"] for each in devices)
     with pytest.raises(SessionError, match="kept"):
-        await asyncio.to_thread(there.request, "POST", f"{API}/queue", {"recipe": "demo"}, 30.0)
+        await asyncio.to_thread(server.request, "POST", f"{API}/queue", {"recipe": "demo"}, 30.0)
     with urllib.request.urlopen(f"http://127.0.0.1:{ports.port}/") as page:
         assert b"thermostand" in page.read()
     async with talking(ports.secop_port or 0) as talk:

@@ -42,18 +42,21 @@ def test_what_is_kept_and_what_is_replaced(tmp_path: Path):
     path = real_stand(tmp_path, cameras=laboratory["cameras"])
     order = load_order(str(tmp_path / "short.yaml"), str(path))
     found = make_rehearsal(order)
-    own, there = order.config, found.config
-    assert there.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"}) == (
+    own, rehearsed = order.config, found.config
+    assert rehearsed.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"}) == (
         own.model_dump(include={"name", "limits", "thermometers", "dew", "ending", "target", "chamber"})
     )
-    assert {name: axis.limits for name, axis in there.axes.items()} == {
+    assert {name: axis.limits for name, axis in rehearsed.axes.items()} == {
         name: axis.limits for name, axis in own.axes.items()
     }
-    assert there.camera is not None
+    assert rehearsed.camera is not None
     assert own.camera is not None
-    assert (there.camera.exposure_s, there.camera.serial_number) == (own.camera.exposure_s, own.camera.serial_number)
-    assert there.bus.address.startswith("tcp:127.0.0.1")
-    assert (there.alerts.command, there.compressor.state_file) == ((), None)
+    assert (rehearsed.camera.exposure_s, rehearsed.camera.serial_number) == (
+        own.camera.exposure_s,
+        own.camera.serial_number,
+    )
+    assert rehearsed.bus.address.startswith("tcp:127.0.0.1")
+    assert (rehearsed.alerts.command, rehearsed.compressor.state_file) == ((), None)
     assert make_rehearsal(found) == found
 
 

@@ -72,7 +72,7 @@ async def test_a_brown_out_of_the_board_drops_the_heater_and_it_is_permitted_aga
     await bench.end()
 
 
-async def test_a_heater_relay_that_does_not_come_on_again_is_said_as_such(bench: Bench):
+async def test_a_heater_relay_that_does_not_come_on_again_is_reported(bench: Bench):
     await bench.start(26, 60)
     await bench.fault("relays.lost_writes", True)
     await bench.fault("relays.brown_out", True)

@@ -1,4 +1,4 @@
-"""`stand run --report`: one command to a complete report, for small recipes and for the night."""
+"""`stand run --report`: one command to a complete report, for small recipes and for the session."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ from thermostand.stand.estimating.estimate import price_plan
 from thermostand.stand.running.order import load_order
 from thermostand.stand.running.session_report import MODEL_NAME, REPORT_NAME
 
-NIGHT = """
+RECIPE = """
 name: a-night
 experiments:
   - warm_up: {table_position: {linear: 0, rotary: 0}, frames: 3, interval_s: 60}
@@ -36,7 +36,7 @@ experiments:
       reference_frames: 2
 """
 EVERY_SEQUENCE = (
-    NIGHT
+    RECIPE
     + """
   - calibration:
       equilibrium_s: 120
@@ -87,7 +87,7 @@ steps:
 
 @pytest.fixture
 def out(tmp_path: Path) -> Iterator[Path]:
-    """A folder for sessions that is not kept: a night is large."""
+    """A folder for sessions that is not kept: a session is large."""
     yield tmp_path / "sessions"
     shutil.rmtree(tmp_path / "sessions", ignore_errors=True)
 
@@ -126,7 +126,7 @@ def check_reported(ended: subprocess.CompletedProcess[str]) -> Path:
 @pytest.mark.parametrize(
     ("text", "frames"),
     [
-        pytest.param(NIGHT, 3 + 2 + 4, id="warm-up and cycle"),
+        pytest.param(RECIPE, 3 + 2 + 4, id="warm-up and cycle"),
         pytest.param(EVERY_SEQUENCE, 3 + 2 + 4 + 4 + 2 * 3, id="every sequence", marks=pytest.mark.nightly),
     ],
 )
@@ -162,7 +162,7 @@ def test_a_warm_up_alone_has_a_report_of_its_drift_and_no_model(out: Path, confi
 
 
 @pytest.mark.usefixtures("compiled_fit")
-def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(out: Path, config_text: Callable[..., str]):
+def test_frames_of_ones_own_steps_have_a_report_of_what_was_recorded(out: Path, config_text: Callable[..., str]):
     ended = run_here(OWN_STEPS, config_text(camera=WHOLE_SENSOR), out)
     assert ended.exit_code == 0, ended.stderr
     session, *lines = ended.stdout.splitlines()
@@ -175,7 +175,7 @@ def test_frames_of_ones_own_steps_have_a_report_of_what_there_is(out: Path, conf
 
 @pytest.mark.nightly
 @pytest.mark.usefixtures("compiled_fit")
-def test_the_night_runs_from_one_command_to_a_complete_report(out: Path, config_text: Callable[..., str]):
+def test_the_session_runs_from_one_command_to_a_complete_report(out: Path, config_text: Callable[..., str]):
     text = config_text(recording={"frame_encoding": "roi"})
     directory = check_reported(run_reported("overnight", text, out, 3600))
     session = Session.open(directory)

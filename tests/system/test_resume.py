@@ -1,4 +1,4 @@
-"""A night that is killed again and again goes on each time where it was, in one session, over every wire."""
+"""A session that is killed again and again goes on each time where it was, in one session, over every wire."""
 
 import asyncio
 import random
@@ -32,22 +32,22 @@ from thermostand.stand.running.order import Order
 from thermostand.stand.running.resume import Interruption, load_interruption
 from thermostand.stand.service.run import Interrupted, resume, run_virtual
 
-NIGHT = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
-ONE_SET_POINT = NIGHT.replace("[30, 20, 24]", "[30]").replace("[20]", "[]")
-ITEMS_PER_LIFE = 400  # about a set-point's worth: with fewer the night would hardly get on
+RECIPE = SHORT_RECIPE.replace("600", "300").replace("frames_per_point: 1", "band_K: 0\n      frames_per_point: 6")
+ONE_SET_POINT = RECIPE.replace("[30, 20, 24]", "[30]").replace("[20]", "[]")
+ITEMS_PER_LIFE = 400  # about a set-point's worth: with fewer the session would hardly get on
 
 
 async def end_laboratory(order: Order) -> None:
     """End what a daemon that was killed has left; it is gone when this returns."""
     simulation = order.config.simulation
     assert simulation is not None
-    is_there = True
-    while is_there:
+    is_present = True
+    while is_present:
         control = ControlSocket(simulation.control)
         try:
             await control.open()
         except Unreachable:
-            is_there = False
+            is_present = False
         else:
             with suppress(Unreachable):  # it may be gone before it has answered
                 await control.request({"do": "quit"})
@@ -73,12 +73,12 @@ def revived(order: Order, out: Path) -> Daemon:
 
 
 def killed_and_resumed(order: Order, out: Path, lives: list[tuple[int, str]]) -> tuple[Path, list[int]]:
-    """The session of a night whose daemons lived for so many items of a kind each, the last to the end; and the frames
-    that were acknowledged at any time."""
+    """The session of a session whose daemons lived for so many items of a kind each, the last to the end; and the
+    frames that were acknowledged at any time."""
     daemon, acknowledged = Daemon(order, out), list[int]()
     for items, kind in lives:
         if not daemon.lives_for(items, kind):
-            break  # the night was shorter
+            break  # the session was shorter
         daemon.kill()
         acknowledged += daemon.acknowledged
         daemon = revived(order, out)
@@ -126,8 +126,8 @@ def check_soaks(directory: Path, order: Order) -> None:
     assert soaked_s == {step_id: duration_s for step_id, duration_s in durations_s.items() if duration_s}
 
 
-def test_a_night_killed_at_three_random_moments_is_one_whole_session(tmp_path: Path, order: Callable[..., Order]):
-    ordered, rng = order(NIGHT), random.Random(3)
+def test_a_session_killed_at_three_random_moments_is_one_whole_session(tmp_path: Path, order: Callable[..., Order]):
+    ordered, rng = order(RECIPE), random.Random(3)
     lives = [(rng.randrange(1, ITEMS_PER_LIFE), "") for _ in range(3)]
     directory, acknowledged = killed_and_resumed(ordered, tmp_path / "out", lives)
     session = check(directory, ordered, acknowledged)
@@ -153,7 +153,7 @@ def test_a_capture_that_was_killed_is_completed_at_its_temperature(tmp_path: Pat
         assert abs(pv.value - 30) <= 1.0
 
 
-async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
+async def test_a_session_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
     tmp_path: Path, order: Callable[..., Order]
 ):
     ordered, out = order(ONE_SET_POINT), tmp_path / "out"
@@ -191,7 +191,7 @@ async def test_a_night_that_was_paused_stopped_and_tripped_goes_on_when_it_may(
 
 
 def test_a_session_whose_files_or_journal_are_not_its_own_is_not_resumed(tmp_path: Path, order: Callable[..., Order]):
-    ordered = order(NIGHT)
+    ordered = order(RECIPE)
     daemon = Daemon(ordered, tmp_path / "out")
     assert daemon.lives_for(1, "StepMark")
     daemon.kill()
@@ -216,14 +216,14 @@ def test_a_session_whose_files_or_journal_are_not_its_own_is_not_resumed(tmp_pat
 @pytest.mark.nightly
 def test_a_hundred_kills_at_random_moments_lose_nothing(tmp_path: Path, order: Callable[..., Order]):
     rng, kills = random.Random(100), 0
-    for night in range(100):
-        ordered = order(NIGHT)
+    for trial in range(100):
+        ordered = order(RECIPE)
         lives = [(rng.randrange(1, ITEMS_PER_LIFE), "") for _ in range(min(4, 100 - kills))]
-        directory, acknowledged = killed_and_resumed(ordered, tmp_path / f"{night}", lives)
+        directory, acknowledged = killed_and_resumed(ordered, tmp_path / f"{trial}", lives)
         session = check(directory, ordered, acknowledged)
         check_soaks(directory, ordered)
         kills += len([event for event in session.events() if event.kind == "gap"])
-        shutil.rmtree(tmp_path / f"{night}")
+        shutil.rmtree(tmp_path / f"{trial}")
         if kills >= 100:
             return
     pytest.fail(f"only {kills} kills")

@@ -50,10 +50,10 @@ def stopped(kind: str = "soak") -> Callable[..., None]:
     return at_step(kind, lambda: os.kill(os.getpid(), signal.SIGINT))
 
 
-def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_said_and_recorded(
+def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_reported_and_recorded(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    """The resumed run trips, of which the session's alert program would be told; then it is resumed to its end."""
+    """The resumed run trips, of which the session's alert program would be reported; then it is resumed to its end."""
     trace, state, tasks = tmp_path / "was-run", tmp_path / "compressor.json", list[asyncio.Task[None]]()
     hostile = order(
         CAPTURES,
@@ -74,10 +74,10 @@ def test_a_program_named_in_a_session_is_not_run_and_what_is_used_instead_is_sai
         asyncio.run(resume(before, at_step("soak", broken)))
     resumed = CliRunner().invoke(app, ["resume", str(directory), "--reset"])
     assert resumed.exit_code == 0, resumed.output
-    said = [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
-    assert len(said) == 2
-    assert "compressor.state_file is not given" in said[0]
-    assert 'not ["/bin/sh", "-c"' in said[1]
+    lines = [line for line in resumed.stderr.splitlines() if "as on this stand" in line]
+    assert len(lines) == 2
+    assert "compressor.state_file is not given" in lines[0]
+    assert 'not ["/bin/sh", "-c"' in lines[1]
     session = Session.open(directory)
     recorded = [event.data for event in session.events() if event.kind == "stand_differs"]
     assert [data["path"] for data in recorded] == ["compressor.state_file", "alerts.command"] * 2
@@ -137,10 +137,10 @@ def test_of_a_session_of_a_real_stand_only_what_its_frames_depend_on_is_kept(tmp
         "recording": own.recording.model_copy(update={"frame_encoding": "raw"}),
     }
     assert config == own.model_copy(update=kept)
-    said = [str(difference) for difference in differences]
-    assert "bus.address is" in said[0]
-    assert len(said) == len({difference.path for difference in differences}) == 13
-    assert any('not ["/bin/rm", "-r", "/"]' in line for line in said)
+    lines = [str(difference) for difference in differences]
+    assert "bus.address is" in lines[0]
+    assert len(lines) == len({difference.path for difference in differences}) == 13
+    assert any('not ["/bin/rm", "-r", "/"]' in line for line in lines)
 
 
 def test_a_thermometer_that_was_renamed_is_reported_as_one_that_came_and_one_that_went(tmp_path: Path):

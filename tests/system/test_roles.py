@@ -60,7 +60,7 @@ async def test_a_safety_thermometer_that_reads_low_is_a_warning_for_it_guards_no
         assert await stand.true("heater_enabled") == 1
 
 
-def test_without_a_safety_thermometer_that_is_read_there_is_no_heat():
+def test_without_a_safety_thermometer_that_is_read_no_heat_is_given():
     assert list_vital_channels(config_of()) == (
         "regulator.pv",
         "thermometers.air",

@@ -62,7 +62,7 @@ async def test_a_session_says_which_package_has_made_steps_of_its_plan(
 
 
 def messages(events: Sequence[Event]) -> list[AlertMessage]:
-    """What receivers of all causes get of a night's events."""
+    """What receivers of all causes get of a session's events."""
     book = AlertTracker("lab", get_args(AlertCause), 0, 1000)
     return [each for event in events for each in (*book.receive(event, event.time_ns), *book.due(event.time_ns))]
 

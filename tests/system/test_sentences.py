@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 BETWEEN_RUNS = Path(__file__).parents[2]
-ROOMS = ("foundation", "drivers", "experiments", "recording", "markers", "stand", "compensation")
+FOLDERS = ("foundation", "drivers", "experiments", "recording", "markers", "stand", "compensation")
 SENTENCES = {"text", "reason"}  # attributes
 TAKEN_APART = {"startswith", "endswith", "removeprefix", "removesuffix", "partition", "rpartition", "split", "rsplit"}
 SEARCHED = {"find", "rfind", "index", "match", "search", "fullmatch", "findall", "finditer", "sub"}
@@ -23,7 +23,7 @@ _SOURCE = re.compile(r"\.(text|reason|args)\b|\b(str|repr)\(")
 # Shown, not decided upon: the sentence of an error with the file's name as it is within the session.
 SHOWN = {
     ("compensation/commands/photographs_cli.py", "collect_views"),
-    # Compared with what was said before and nothing else: whether a message repeats.
+    # Compared with what was reported before and nothing else: whether a message repeats.
     ("foundation/repeat_limit.py", "_admit_sentence"),
 }
 
@@ -122,7 +122,7 @@ def read_sentences(source: str) -> Iterator[tuple[str, int]]:
 
 def test_no_sentence_is_read():
     found = []
-    for path in sorted(path for room in ROOMS for path in (BETWEEN_RUNS / room).rglob("*.py")):
+    for path in sorted(path for folder in FOLDERS for path in (BETWEEN_RUNS / folder).rglob("*.py")):
         name = str(path.relative_to(BETWEEN_RUNS))
         places = read_sentences(path.read_text(encoding="utf-8"))
         found += [f"{name}:{line} in {function}" for function, line in places if (name, function) not in SHOWN]

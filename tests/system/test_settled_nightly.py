@@ -1,7 +1,7 @@
 """What dwells until the camera has settled save, and what they cost: the same cycle with both kinds of dwell.
 
-All models are scored on the same third night, at temperatures none has seen and after dwells twice as long, on the true
-centres that the simulated camera had. `pytest -m nightly -s` prints the figures.
+All models are scored on the same third session, at temperatures none has seen and after dwells twice as long, on the
+true centres that the simulated camera had. `pytest -m nightly -s` prints the figures.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ THERMAL_MOST_WORSE_MPX = {"settled": 1.5, "hurried": 3.5}
 
 
 @dataclass(frozen=True)
-class Night:
+class Record:
     """true_px (F, 54, 2): noise-free centres of each frame."""
 
     observed: Observations
@@ -71,7 +71,7 @@ class Night:
     duration_s: float
 
 
-async def night(order: Order, out: Path) -> Night:
+async def run_session(order: Order, out: Path) -> Record:
     """Run, asking the simulated laboratory for the truth at each frame."""
     truth: list[object] = []
 
@@ -85,7 +85,7 @@ async def night(order: Order, out: Path) -> Night:
     path = await run_virtual(order, out, 1, watch)
     steps = Session.open(path).steps()
     duration_s = (steps[-1].time_ns - steps[0].time_ns) / NS_PER_S
-    return Night(observe([path], progress), np.array(truth), duration_s)
+    return Record(observe([path], progress), np.array(truth), duration_s)
 
 
 def true_centres(order: Order) -> object:
@@ -97,7 +97,7 @@ def true_centres(order: Order) -> object:
         return json.loads(lines.readline())["centres_px"]
 
 
-def true_rms_mpx(model: DriftModel, third: Night) -> NDArray[np.float64]:
+def true_rms_mpx(model: DriftModel, third: Record) -> NDArray[np.float64]:
     """(2,) along I and J: what the model leaves of the true drift, mpx."""
     reference_px = third.true_px[third.observed.of(Role.REFERENCE)].mean(axis=0)
     states = compute_frame_states(third.observed, model.memory)
@@ -111,11 +111,11 @@ def true_rms_mpx(model: DriftModel, third: Night) -> NDArray[np.float64]:
 async def test_settled_dwells_save_a_third_of_the_cycle_and_the_thermal_form_loses_little(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    third = await night(order(THIRD), tmp_path / "third")
+    third = await run_session(order(THIRD), tmp_path / "third")
     hours: dict[str, float] = {}
     true_mpx: dict[tuple[str, str], NDArray[np.float64]] = {}
     for name, recipe in (("fixed", FIXED), ("settled", SETTLED), ("hurried", HURRIED)):
-        cycle = await night(order(recipe), tmp_path / name)
+        cycle = await run_session(order(recipe), tmp_path / name)
         hours[name] = cycle.duration_s / 3600
         for form in ("paper", "thermal"):
             left = true_rms_mpx(fit(cycle.observed, form=form), third)

@@ -73,7 +73,7 @@ async def together(config: StandConfig, frames: int, period_s: float = 0.0) -> t
     return len(shots), sum(frame.dropped for frame in shots), late_s
 
 
-async def test_three_cameras_that_leave_room_for_each_other_lose_nothing(three: StandConfig):
+async def test_three_cameras_that_leave_time_for_each_other_lose_nothing(three: StandConfig):
     assert (await together(three, frames=4))[:2] == (12, 0)
 
 

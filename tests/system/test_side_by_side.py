@@ -13,7 +13,7 @@ from tests.system.test_run import digests
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.stand_config import find_packaged
 
-# A night as short as it can be.
+# A session as short as it can be.
 RECIPE = (
     SHORT_RECIPE.replace("600", "60")
     .replace("[30, 20, 24]", "[26]")
@@ -35,7 +35,7 @@ def ended(run: subprocess.Popen[str]) -> Path:
     return Path(stdout.splitlines()[-1])
 
 
-def test_two_virtual_nights_side_by_side_of_the_installed_configuration_give_the_same_session(tmp_path: Path):
+def test_two_virtual_sessions_side_by_side_of_the_installed_configuration_give_the_same_session(tmp_path: Path):
     recipe = tmp_path / "short.yaml"
     recipe.write_text(RECIPE)
     config = tmp_path / "config.yaml"  # how full this machine's disk is adds no event

@@ -38,7 +38,7 @@ def test_each_page_is_made(site: Path):
         ("reference/events.html", ("guard.over_temperature", "soak_longer")),
         ("reference/cli-stand.html", ("stand session verify", "--virtual-time")),
         ("reference/cli-compensate.html", ("compensate calibrate-rig", "--like")),
-        ("reference/model-file.html", ("leverage_matrix_px2", "between_nights_px")),
+        ("reference/model-file.html", ("leverage_matrix_px2", "between_sessions_px")),
         ("reference/python-api.html", ("thermostand.compensation.fit", "centres_px")),
     ],
 )
@@ -48,7 +48,7 @@ def test_a_reference_that_is_made_has_what_the_program_has(site: Path, page: str
     assert [entry for entry in entries if entry not in text] == []
 
 
-def test_the_files_that_are_the_architecture_are_there():
+def test_the_files_of_the_architecture_exist():
     rows = re.findall(r"^\| `([^`]+\.py)`", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(rows) == 12
     assert [row for row in rows if not (ROOT / row).is_file()] == []

@@ -16,7 +16,7 @@ from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 
-INFO = SessionInfo("night-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
+INFO = SessionInfo("cycle-1", "warm_up", "DA1234567", "", "0.1.0", "wall")
 SETTINGS = RecordingSettings(
     "raw", telemetry_commit_s=0.2, queue_frames=5, stop_frames_below_bytes=0, alert_below_fraction=0.0
 )

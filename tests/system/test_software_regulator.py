@@ -71,7 +71,7 @@ async def test_it_is_not_tuned_where_nothing_is_held(tmp_path: Path):
             await regulator_of(stand).autotune()
 
 
-async def test_without_permission_there_is_no_pulse_and_stopped_it_is_off(tmp_path: Path):
+async def test_without_permission_no_pulse_is_given_and_stopped_it_is_off(tmp_path: Path):
     async with virtual_stand(bare_config("software-regulator", tmp_path)) as stand:
         regulator, permits = regulator_of(stand), stand.assembly.stand.chamber.permits
         with pytest.raises(Refused, match="no set-point"):
@@ -92,7 +92,7 @@ async def test_without_permission_there_is_no_pulse_and_stopped_it_is_off(tmp_pa
         assert not await heats(stand)
 
 
-async def test_without_a_good_temperature_there_is_no_heat_and_the_integral_waits(tmp_path: Path):
+async def test_without_a_good_temperature_no_heat_is_given_and_the_integral_waits(tmp_path: Path):
     async with virtual_stand(bare_config("software-regulator", tmp_path, {"guard": {"stale_after_s": 30}})) as stand:
         await stand.hold(45, 1800)
         _, held_percent = stand.series["regulator.mv_heat"][-1]

@@ -128,7 +128,7 @@ async def test_a_target_outside_the_limits_is_refused_and_nothing_is_sent(bench:
     assert bench.tap.requests == before
 
 
-async def test_a_stage_that_is_not_homed_refuses_to_move_and_its_position_is_doubtful(bench: Bench) -> None:
+async def test_a_stage_that_is_not_homed_refuses_to_move_and_its_position_is_suspect(bench: Bench) -> None:
     await bench.axis.open()
     with pytest.raises(Refused, match="not homed"):
         await bench.axis.move_to(1.0)
@@ -276,7 +276,7 @@ async def test_a_move_that_never_ends_is_stopped_softly_in_time(bench: Bench) ->
     assert (bench.tap.count("sstp"), bench.tap.count("stop")) == (1, 0)
 
 
-async def test_a_motor_without_current_is_doubtful_and_the_same_target_approaches_again(bench: Bench) -> None:
+async def test_a_motor_without_current_is_suspect_and_the_same_target_approaches_again(bench: Bench) -> None:
     """The rotor falls into the next full step, here by 0.4 of one."""
     axis = await bench.ready()
     await axis.move_to(10.001)

@@ -119,7 +119,7 @@ def three_cameras(data: Data) -> None:
         data["cameras"][f"side_{number}"] = {"address": f"127.0.0.{40 + number}", "poll_s": 5.0, "boot_s": 4.0}
 
 
-def beside(data: Data) -> None:
+def add_units(data: Data) -> None:
     """An imager, contacts, instruments with a line of their own."""
     data["imager"] = {"folder": "/nowhere/pictures", "spots": {"lens": {"x_px": 80, "y_px": 60}}}
     data["inputs"] = {"registers": "waveshare-inputs", "unit": 9, "contacts": {"door": {"channel": 0}}}
@@ -162,7 +162,7 @@ PLACES: Mapping[str, tuple[Choice, ...]] = {
         Choice("no camera", lambda data: data.update(cameras={}), ("no cameras",)),
         Choice("3 cameras", three_cameras),
     ),
-    "beside": (Choice("alone", nothing), Choice("imager, inputs, probes", beside)),
+    "extras": (Choice("alone", nothing), Choice("imager, inputs, probes", add_units)),
 }
 Combination = tuple[Choice, ...]
 
@@ -194,7 +194,7 @@ def pairwise() -> Iterator[Combination]:
 
 COMBINATIONS = tuple(pairwise())
 NOT_SIMULATED = {"eurotherm-3200", "watlow-ez-zone", "watlow-f4t"}
-RUN_BY_NIGHT = tuple(each for each in COMBINATIONS if each[0].name not in NOT_SIMULATED)
+RUN_NIGHTLY = tuple(each for each in COMBINATIONS if each[0].name not in NOT_SIMULATED)
 
 
 def named(combination: Combination) -> str:
@@ -246,13 +246,13 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
     if data["cameras"] and config.relays is None:
         with pytest.raises(ConfigError, match="no relay switches"):
             check_plan(recipe([{"power_camera": False}]).plan(), config)
-    said = [f"no {each.what}" for each in list_missing_devices(config)]
+    missing = [f"no {each.what}" for each in list_missing_devices(config)]
     expected = [absent for choice in combination for absent in choice.absent]
     if "granite_inside" in data["thermometers"]:  # ours is not controlled by the only one
         expected = [each for each in expected if each not in NO_GRANITE]
     if "relays" in data and "no relay board" in expected:  # a regulator keeps its board
         expected.remove("no relay board")
-    assert sorted(said) == sorted(expected)
+    assert sorted(missing) == sorted(expected)
     devices = assemble(config, Hub(), VirtualClock(0)).devices
     assert (set(devices.axes), set(devices.cameras), set(devices.probes)) == (
         set(data["axes"]),
@@ -274,7 +274,7 @@ def test_each_combination_plans_what_it_can_and_says_what_it_cannot(combination:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("combination", RUN_BY_NIGHT, ids=named)
+@pytest.mark.parametrize("combination", RUN_NIGHTLY, ids=named)
 async def test_each_combination_runs_and_records_what_it_lacks(combination: Combination, tmp_path: Path):
     require_aravis()
     data = written(combination, tmp_path)
@@ -316,7 +316,7 @@ FEWEST = chosen(relays="no compressor", flap="no flap", axes="no axes", thermome
 
 @pytest.mark.parametrize(
     "combination",
-    [FEWEST, *(pytest.param(each, marks=pytest.mark.nightly) for each in RUN_BY_NIGHT if each[5].name != "no camera")],
+    [FEWEST, *(pytest.param(each, marks=pytest.mark.nightly) for each in RUN_NIGHTLY if each[5].name != "no camera")],
     ids=named,
 )
 async def test_each_combination_is_reported(combination: Combination, tmp_path: Path):

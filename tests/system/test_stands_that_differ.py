@@ -93,7 +93,7 @@ async def test_sixteen_thermometers_other_stages_and_instruments_are_one(tmp_pat
     assert not [event.kind for event in session.events() if event.kind.startswith(("guard.", "absent"))]
 
 
-def test_what_a_stand_lacks_is_said_before_it_runs(build: Callable[..., Order]):
+def test_what_a_stand_lacks_is_reported_before_it_runs(build: Callable[..., Order]):
     assert list_missing_devices(build(lambda data: None, RECIPE).config) == ()
     with pytest.raises(ConfigError, match="needs a camera"):
         check_plan(

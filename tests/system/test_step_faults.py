@@ -97,7 +97,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-async def test_a_fault_holds_the_run_whoever_meets_it_and_the_plan_is_completed(
+async def test_a_fault_holds_the_run_wherever_it_is_met_and_the_plan_is_completed(
     tmp_path: Path, order: Callable[..., Order], name: str
 ):
     text, holds = FAULTS[name]

@@ -28,7 +28,9 @@ from thermostand.stand.service.run import Interrupted, resume, run_virtual
 RECIPE = "name: away\nsteps:\n  - start_chamber: {set_point}\n  - soak: {soak_s}\n  - stop_chamber\n"
 
 
-async def night(folder: Path, set_point: float, soak_s: int = 900, **ending: object) -> tuple[Session, list[Event]]:
+async def run_session(
+    folder: Path, set_point: float, soak_s: int = 900, **ending: object
+) -> tuple[Session, list[Event]]:
     """A run of a stand without a camera that ends away from the laboratory's 24 degC."""
     data = yaml.safe_load(find_packaged("", "simulated").read_text())
     data["cameras"], data["axes"] = {}, {}
@@ -50,7 +52,7 @@ async def night(folder: Path, set_point: float, soak_s: int = 900, **ending: obj
 
 @pytest.mark.parametrize("set_point", [14.0, 36.0])
 async def test_a_chamber_that_is_away_comes_back(tmp_path: Path, set_point: float):
-    session, seen = await night(tmp_path, set_point)
+    session, seen = await run_session(tmp_path, set_point)
     kinds = [event.kind for event in seen]
     assert kinds.index("to_ambient") < kinds.index("at_ambient") < kinds.index("run.end")
     laboratory_degC = session.readings("thermometers.laboratory")[1][-1]
@@ -66,17 +68,17 @@ async def test_a_chamber_that_is_away_comes_back(tmp_path: Path, set_point: floa
 
 
 async def test_after_the_longest_time_it_is_reported_that_it_is_not(tmp_path: Path):
-    _, seen = await night(tmp_path, 14.0, max_s=60)
+    _, seen = await run_session(tmp_path, 14.0, max_s=60)
     (reported,) = (event for event in seen if event.kind == "not_at_ambient")
     assert reported.level == "warning"
     assert reported.text.startswith("after 1 min the air is ")
 
 
 @pytest.mark.parametrize(("set_point", "ending"), [(24.5, {}), (14.0, {"to_ambient": False})])
-async def test_nothing_happens_where_it_is_there_or_not_wanted(
+async def test_nothing_happens_where_it_is_reached_or_not_wanted(
     tmp_path: Path, set_point: float, ending: dict[str, bool]
 ):
-    _, seen = await night(tmp_path, set_point, 300, **ending)
+    _, seen = await run_session(tmp_path, set_point, 300, **ending)
     assert not {"to_ambient", "at_ambient", "not_at_ambient"} & {event.kind for event in seen}
 
 

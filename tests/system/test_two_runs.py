@@ -99,9 +99,9 @@ async def test_a_second_run_touches_nothing_until_the_first_has_ended(
             while second.poll() is None:
                 await laboratory.heater_is_on()
         assert second.returncode == 1
-        said = second.communicate()[1]
+        output = second.communicate()[1]
         in_use = rf"error: [a-z]+: [^\n]* is in use by session {session} \(pid {first.pid}\); nothing was touched\n"
-        assert re.search(in_use, said), said
+        assert re.search(in_use, output), output
         assert not other.exists()
         for _ in range(100):
             await laboratory.heater_is_on()

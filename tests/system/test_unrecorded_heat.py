@@ -201,7 +201,7 @@ async def test_a_folder_that_is_taken_away_holds_the_run_until_an_operator_clear
 
 
 @pytest.mark.nightly
-async def test_a_lack_of_memory_is_said_in_words(
+async def test_a_lack_of_memory_is_reported_in_words(
     tmp_path: Path, order: Callable[..., Order], simulator: Callable[..., object]
 ):
     """Raised where a reading is taken over, as any allocation may."""

@@ -46,20 +46,20 @@ def pytest_in(folder: Path, *options: str) -> str:
     (folder / "test_many.py").write_text(MANY)
     command = [sys.executable, "-m", "pytest", "-c", os.devnull, "--rootdir", ".", "-p", "no:cacheprovider", *options]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
-    said = folder / "said.txt"  # a pipe would be open until the process that a test has left ends
-    with said.open("w") as file:
+    output = folder / "said.txt"  # a pipe would be open until the process that a test has left ends
+    with output.open("w") as file:
         done = subprocess.run(command, cwd=folder, env=environment, stdout=file, stderr=subprocess.STDOUT, timeout=100)
-    assert done.returncode == 1, said.read_text()
-    return said.read_text()
+    assert done.returncode == 1, output.read_text()
+    return output.read_text()
 
 
 def test_every_test_is_reported_once_also_when_one_ends_its_worker(tmp_path: Path):
-    said = pytest_in(tmp_path, "-v", "-rfE")
-    assert re.search(r"3 failed, 41 passed, 1 error in", said), said
+    output = pytest_in(tmp_path, "-v", "-rfE")
+    assert re.search(r"3 failed, 41 passed, 1 error in", output), output
     assert sorted(
         re.findall(
             r"^(?:FAILED|ERROR) (\S+) - (.*)$",
-            re.sub(r"worker \d ended .* test", "worker N ended", said),
+            re.sub(r"worker \d ended .* test", "worker N ended", output),
             re.MULTILINE,
         )
     ) == [
@@ -68,11 +68,11 @@ def test_every_test_is_reported_once_also_when_one_ends_its_worker(tmp_path: Pat
         ("test_ends.py::test_fails", "AssertionError"),
         ("test_many.py::test_each[7]", "assert 7 != 7"),
     ]
-    assert "\nshown\n" in said
-    assert "not shown" not in said
+    assert "\nshown\n" in output
+    assert "not shown" not in output
 
 
 def test_no_unit_is_begun_after_the_last_failure_that_is_wanted(tmp_path: Path):
-    said = pytest_in(tmp_path, "-x")
-    assert re.search(r"stopping after \d failures", said), said
-    assert not re.search(r"\b(?:39|4\d) passed", said), said
+    output = pytest_in(tmp_path, "-x")
+    assert re.search(r"stopping after \d failures", output), output
+    assert not re.search(r"\b(?:39|4\d) passed", output), output

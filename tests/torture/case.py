@@ -69,7 +69,7 @@ PLAIN = {
     "axes": "two axes",
     "thermometers": "5",
     "cameras": "1 camera",
-    "beside": "alone",
+    "extras": "alone",
 }
 
 
@@ -107,8 +107,8 @@ _HAS: dict[str, Callable[[dict[str, str]], bool]] = {
     "regulator": lambda stand: stand["heat"] == "omron-e5cc",
     "heat_module": lambda stand: stand["heat"] == "heat module",
     "relays": lambda stand: stand["heat"] not in CHAMBERS or stand["relays"] != "no board",
-    "inputs": lambda stand: stand["beside"] != "alone",
-    "imager": lambda stand: stand["beside"] != "alone",
+    "inputs": lambda stand: stand["extras"] != "alone",
+    "imager": lambda stand: stand["extras"] != "alone",
     "flap": lambda stand: stand["flap"] == "flap",
     "camera": lambda stand: stand["cameras"] != "no camera",
     "axis": lambda stand: stand["axes"] != "no axes",

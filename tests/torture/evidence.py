@@ -91,7 +91,7 @@ class Evidence:
         self.stand = yaml.safe_load((self.folder / "stand.yaml").read_text())
         self.session = next(iter(sorted((self.folder / "out").glob("*/journal.jsonl"))), self.folder / "none/x").parent
         self._read_all()
-        if self.is_complete and any(said.kind == GIVEN_UP for said in self.events):
+        if self.is_complete and any(event.kind == GIVEN_UP for event in self.events):
             for found in (self.unreadable, self.events, self.marks, self.frames, self.metas, self.temperatures):
                 found.clear()
             for session in self.sessions:
@@ -137,7 +137,7 @@ class Evidence:
 
     @cached_property
     def bus(self) -> list[list[Exchange]]:
-        """What was said on the bus, one list a life."""
+        """What was reported on the bus, one list a life."""
         return [list(self._bus(number)) for number in range(len(self.lives))]
 
     @cached_property
@@ -335,7 +335,7 @@ class RealEvidence(Evidence):
     def killed_soon(self, at_s: float, within_s: float) -> bool:
         """As for virtual time; what wrote for the daemon counts, and a run's end, behind which the process that writes
         the record between runs has to start."""
-        ends_s = [self.at_s(said.time_ns) for said in self.events if said.kind == "run.end"]
+        ends_s = [self.at_s(event.time_ns) for event in self.events if event.kind == "run.end"]
         deaths_s = [order.at_s for order in self.case.orders if order.verb == "disk_process_killed"]
         return super().killed_soon(at_s, within_s) or any(
             0 <= death_s - at_s <= within_s for death_s in (*deaths_s, *(end_s + within_s for end_s in ends_s))

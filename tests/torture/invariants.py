@@ -124,7 +124,7 @@ def heat_needs_fresh_readings(evidence: Evidence) -> Iterator[str]:
 @invariant(Leg.BOTH)
 def nothing_heats_unrecorded(evidence: Evidence) -> Iterator[str]:
     """No heat before the run's begin is recorded."""
-    begun = [said.time_ns for said in evidence.events if said.kind in ("run.start", "run.resume")]
+    begun = [event.time_ns for event in evidence.events if event.kind in ("run.start", "run.resume")]
     for truth in evidence.truth:
         heats = (truth["heater_enabled"] > 0) & (truth["heater_on_fraction"] > 0) & (truth["cut_out_open"] == 0)
         for row in truth[heats][:1]:
@@ -156,12 +156,14 @@ def compressor_rests(evidence: Evidence) -> Iterator[str]:
 def _holds(evidence: Evidence) -> Iterator[tuple[int, int]]:
     """From when to when the guard's interlock held the run."""
     begun_ns = None
-    for said in sorted(evidence.events, key=lambda each: each.time_ns):
-        is_interlock = said.data.get("reason") == "interlock"
-        if said.kind == "held" and is_interlock:
-            begun_ns = begun_ns or said.time_ns
-        elif begun_ns and ((said.kind == "released" and is_interlock) or said.kind in ("gap", "run.resume", "run.end")):
-            yield begun_ns, said.time_ns
+    for event in sorted(evidence.events, key=lambda each: each.time_ns):
+        is_interlock = event.data.get("reason") == "interlock"
+        if event.kind == "held" and is_interlock:
+            begun_ns = begun_ns or event.time_ns
+        elif begun_ns and (
+            (event.kind == "released" and is_interlock) or event.kind in ("gap", "run.resume", "run.end")
+        ):
+            yield begun_ns, event.time_ns
             begun_ns = None
 
 
@@ -261,7 +263,7 @@ def files_are_readable(evidence: Evidence) -> Iterator[str]:
 
 
 @invariant(Leg.BOTH)
-def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
+def frames_saved_are_recorded_once(evidence: Evidence) -> Iterator[str]:
     """What HTTP said was saved, and what captures that are done have to have since they were begun last: no more of a
     camera that nothing has befallen."""
     for (topic, time_ns), count in evidence.frames.items():
@@ -269,20 +271,20 @@ def frames_saved_are_there_once(evidence: Evidence) -> Iterator[str]:
             yield f"{topic} has the frame at {evidence.at_s(time_ns)} s {count} times"
     for row in (row for doors in evidence.doors for row in doors):
         run = row["answer"].get("run") if isinstance(row["answer"], dict) else None
-        there = sum(time_ns <= row["time_ns"] + EXPOSED_S * 1e9 for _, time_ns in evidence.frames)
-        if run and run["frames_saved"] > there:
+        due = sum(time_ns <= row["time_ns"] + EXPOSED_S * 1e9 for _, time_ns in evidence.frames)
+        if run and run["frames_saved"] > due:
             at_s = evidence.at_s(row["time_ns"])
-            yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {there} are there"
+            yield f"{run['frames_saved']} frames were saved at {at_s} s, of which {due} are there"
     skipped = {entry.get("step_id") for entry in evidence.journal if entry["entry"] == "Skipped"}
-    lost = {said.data.get("step_id") for said in evidence.events if "lost" in said.kind or "dropped" in said.kind}
+    lost = {event.data.get("step_id") for event in evidence.events if "lost" in event.kind or "dropped" in event.kind}
     times_ns = {time_ns for _, time_ns in evidence.frames}
-    begun_ns = {said.data["step_id"]: said.time_ns for said in evidence.events if said.kind == "capture_restarted"}
+    begun_ns = {event.data["step_id"]: event.time_ns for event in evidence.events if event.kind == "capture_restarted"}
     taken = Counter(
         step_id
         for time_ns, step_id, _ in evidence.metas
         if time_ns in times_ns and time_ns >= begun_ns.get(step_id, time_ns)
     )
-    is_lossy = any(said.kind == "camera_lost" for said in evidence.events) or any(
+    is_lossy = any(event.kind == "camera_lost" for event in evidence.events) or any(
         fault.name.startswith("camera") for fault in evidence.case.faults
     )
     for mark in evidence.marks:
@@ -342,7 +344,7 @@ def readings_are_true(evidence: Evidence) -> Iterator[str]:
 @invariant(Leg.BOTH)
 def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
     """A temperature that HTTP showed is in the recording, but for the last ones before a kill."""
-    if not evidence.is_complete or any("lost" in said.kind or "dropped" in said.kind for said in evidence.events):
+    if not evidence.is_complete or any("lost" in event.kind or "dropped" in event.kind for event in evidence.events):
         return
     recorded = {name: sorted((row[0], row[1]) for row in rows) for name, rows in evidence.temperatures.items()}
     for row in (row for doors in evidence.doors for row in doors):
@@ -356,8 +358,8 @@ def http_says_what_is_recorded(evidence: Evidence) -> Iterator[str]:
             first = bisect.bisect_left(rows, (time_ns, -math.inf))
             last = bisect.bisect_right(rows, (time_ns + evidence.batch_ns, math.inf))
             values = [value for _, value in rows[first:last]]
-            is_there = any(abs(value - shown["value"]) < 1e-6 for value in values)
-            if not is_there and not evidence.killed_soon(at_s, DURABLE_S):
+            is_recorded = any(abs(value - shown["value"]) < 1e-6 for value in values)
+            if not is_recorded and not evidence.killed_soon(at_s, DURABLE_S):
                 yield f"HTTP showed {channel} {shown['value']:.3f} of {at_s} s, the recording has {values}"
 
 
@@ -386,7 +388,7 @@ def verify_finds_what_is_lost_and_nothing_else(evidence: Evidence) -> Iterator[s
     except ValueError:
         yield f"verify ended with {ended.returncode}: {ended.stderr[-300:]}"
         return
-    lost = any("lost" in said.kind or "dropped" in said.kind for said in evidence.events)
+    lost = any("lost" in event.kind or "dropped" in event.kind for event in evidence.events)
     if not found["sound"] and not lost:
         yield f"verify finds {found['findings'][:2]}"
     if found["frames"] != len(evidence.frames):
@@ -424,11 +426,11 @@ def is_completed_in_the_end(evidence: Evidence) -> Iterator[str]:
 
 
 @invariant(Leg.VIRTUAL)
-def is_told_what_to_mend(evidence: Evidence) -> Iterator[str]:
-    """Who resumes mends what he was told: nothing ends a run a third time with the same words."""
+def advice_says_what_to_mend(evidence: Evidence) -> Iterator[str]:
+    """Who resumes mends what he was reported: nothing ends a run a third time with the same words."""
     ends = (life.err.strip().splitlines() for life in evidence.lives if life.status in (1, 4))
-    said = Counter(_without_numbers(lines[-1]) for lines in ends if lines)
-    for words, count in said.items():
+    event = Counter(_without_numbers(lines[-1]) for lines in ends if lines)
+    for words, count in event.items():
         if count > 2:
             yield f"{count} lives ended with: {words[:300]}"
 
@@ -440,10 +442,10 @@ def _without_numbers(text: str) -> str:
 @invariant(Leg.BOTH)
 def nobody_is_pestered(evidence: Evidence) -> Iterator[str]:
     """No warning or error more than six times an hour."""
-    times: dict[tuple[str, str], set[int]] = {}  # what is said while a run begins is in two records
-    for said in evidence.events:
-        if said.level != "info":
-            times.setdefault((said.kind, _without_numbers(said.text)), set()).add(said.time_ns)
+    times: dict[tuple[str, str], set[int]] = {}  # what is reported while a run begins is in two records
+    for event in evidence.events:
+        if event.level != "info":
+            times.setdefault((event.kind, _without_numbers(event.text)), set()).add(event.time_ns)
     for (kind, text), instants in times.items():
         when = sorted(instants)
         spans = [last - first for first, last in zip(when, when[MOST_AN_HOUR:], strict=False)]

@@ -97,11 +97,11 @@ class Breaking(FaultSchedule):
 
 def list_planned_faults(case: Case, now_ns: int, folder: Path, life: int) -> list[PlannedFault]:
     """What is still to come of the case's faults, or stands, seen from now. An operator who has resumed in vain mends
-    what he was told, of what stood until then; in the end everything. In real time they are broken over the control
+    what he was reported, of what stood until then; in the end everything. In real time they are broken over the control
     socket."""
     if life >= MENDED_AT_LIFE or case.is_real:
         return []
-    told = "".join((folder / f"said-{number}.txt").read_text() for number in range(1, life))
+    log = "".join((folder / f"said-{number}.txt").read_text() for number in range(1, life))
     path = folder / f"truth-{life - 1}.bin"
     before = path.read_bytes()[-ROW.size :] if path.exists() else b""
     until_ns = max(now_ns, ROW.unpack(before)[0] if before else 0)
@@ -110,14 +110,14 @@ def list_planned_faults(case: Case, now_ns: int, folder: Path, life: int) -> lis
     return [
         PlannedFault(each.name, each.value, max(0.0, each.at_s - now_s), each.for_s - max(0.0, now_s - each.at_s))
         for each in left
-        if each.at_s > until_s or not is_named(each, told)
+        if each.at_s > until_s or not is_named(each, log)
     ]
 
 
-def is_named(fault: Fault, told: str) -> bool:
+def is_named(fault: Fault, log: str) -> bool:
     """Whether these words name the fault's device."""
     device = fault.name.partition(".")[0]
-    return re.search(rf"\b(?:{_NAMED.get(device, device)})", told) is not None
+    return re.search(rf"\b(?:{_NAMED.get(device, device)})", log) is not None
 
 
 def main() -> int:

@@ -256,9 +256,9 @@ def main() -> int:
         for count, (each, look) in enumerate(zip(made, looks, strict=True), 1):
             found = look.result()
             how[_kind(found)] += 1
-            said = found or f"NOT FOUND\n    was: {each.was}\n    now: {each.now}"
+            text = found or f"NOT FOUND\n    was: {each.was}\n    now: {each.now}"
             minutes_left = (time.monotonic() - begun_s) / count * (len(made) - count) / 60.0
-            sys.stdout.write(f"[{count}/{len(made)}, {minutes_left:.0f} min left] {each.file}:{each.line}: {said}\n")
+            sys.stdout.write(f"[{count}/{len(made)}, {minutes_left:.0f} min left] {each.file}:{each.line}: {text}\n")
             sys.stdout.flush()
     minutes, processor_min = (time.monotonic() - begun_s) / 60.0, _processor_s() / 60.0
     counts = ", ".join(f"{number} {name}" for name, number in how.most_common())

@@ -468,9 +468,9 @@ class Bench:
         command = ["serve", str(self._folder / "stand.yaml"), "--out", str(self.disk / "out"), "--no-reports"]
         command += ["--port", str(self.port), "--secop", str(self.secop)]
         program = [sys.executable, "-X", "faulthandler", "-m", "thermostand.stand.cli", *command]
-        self._said = self._folder / f"said-{self._daemons}.txt"
+        self._output = self._folder / f"said-{self._daemons}.txt"
         self._daemons += 1
-        with self._said.open("w") as file:
+        with self._output.open("w") as file:
             self.daemon = subprocess.Popen(program, cwd=ROOT, env=self._env, stdout=file, stderr=file, text=True)
         self._begun_ns, self._opened_ns = self.clock.now_ns(), 0
 
@@ -493,7 +493,7 @@ class Bench:
                 self._over.wait(LOOK_S)
         status = None if is_hung else self.daemon.returncode
         times_ns = (self._begun_ns, self._opened_ns, self.clock.now_ns(), self._offset_ns)
-        return Life([], status, "", self._said.read_text(errors="replace"), *times_ns)
+        return Life([], status, "", self._output.read_text(errors="replace"), *times_ns)
 
     def _operate(self) -> None:
         """As an operator who wants the plan done: submit it, reset what holds it, resume it."""

@@ -47,9 +47,9 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
         left = _compute_digests(place)  # before the evidence, for which what is unfinished is salvaged
         evidence = (RealEvidence if case.is_real else Evidence)(begun, place, lives)
         spans_ns = [int(each["time_ns"][-1] - each["time_ns"][0]) for each in evidence.truth if len(each)]
-        events = Counter(said.kind for said in evidence.events)
-        trips = [said for said in evidence.events if said.kind.startswith("guard.") and "rule" in said.data]
-        rules = Counter(str(said.data["rule"]) for said in trips)
+        events = Counter(event.kind for event in evidence.events)
+        trips = [event for event in evidence.events if event.kind.startswith("guard.") and "rule" in event.data]
+        rules = Counter(str(event.data["rule"]) for event in trips)
         steps = {mark.step_id: mark.kind for mark in evidence.marks}
         found = tuple(violations(evidence))
         if twice and not case.kills_s and all(life.status is not None for life in evidence.lives):

@@ -74,7 +74,7 @@ def middle_ns(evidence: Evidence) -> int:
 
 
 def no_more(evidence: Evidence, is_of_it: Callable[[int], bool]) -> None:
-    """Nothing is said to such units from the middle on."""
+    """Nothing is reported to such units from the middle on."""
     middle = middle_ns(evidence)
     evidence.bus[0] = [each for each in evidence.bus[0] if each.time_ns < middle or not is_of_it(each.unit)]
     changed(evidence, "heater_enabled", 1.0, 0.4)

@@ -13,7 +13,7 @@ TABLE = table()
 
 
 @pytest.mark.parametrize("file", TABLE["tests"])
-def test_a_file_has_tests_that_are_there(file: str):
+def test_a_file_has_tests_that_exist(file: str):
     assert (ROOT / file).is_file()
     names = " ".join(TABLE["tests"][file]).split()
     assert [name for name in names if not (ROOT / name).is_file()] == []

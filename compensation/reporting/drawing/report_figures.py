@@ -230,15 +230,15 @@ def draw_compensated_paths(observations: Observations, evaluation: Evaluation) -
 
 def draw_measured_against_model(evaluation: Evaluation) -> Figure:
     """Each scored centre: the drift that was measured against the drift that the model says."""
-    measured, said = -evaluation.before_px, evaluation.after_px - evaluation.before_px
+    measured, predicted = -evaluation.before_px, evaluation.after_px - evaluation.before_px
     drawn = thin(len(measured), _MOST_DOTS)
     shown: list[Panel] = []
     for index, (name, colour) in enumerate(COORDINATES):
-        both = np.concatenate([said[:, index], measured[:, index]])
+        both = np.concatenate([predicted[:, index], measured[:, index]])
         ends = [float(both.min()), float(both.max())]
         marks: list[Mark] = [
             make_curve(ends, ends, "black", "measured = model", linewidth=0.8),
-            make_dots(said[drawn, index], measured[drawn, index], colour, "marker centres"),
+            make_dots(predicted[drawn, index], measured[drawn, index], colour, "marker centres"),
             lambda axes: [scale.set_major_locator(MaxNLocator(5)) for scale in (axes.xaxis, axes.yaxis)],
         ]
         labels = {"xlabel": f"drift along {name}, model (px)", "ylabel": "" if index else "drift, measured (px)"}

@@ -102,8 +102,8 @@ class Regulator:
         async with self._exclusive:
             await self._ensure_started()
             known_by = "; ".join(map(str, self._map.in_force))
-            not_told = self._map.not_told or ("" if known_by else "its register map has no in_force")
-            return InForce(known_by, not_told, self._objections(await self._unit.snapshot(self._map.polled())))
+            unverified = self._map.unverified or ("" if known_by else "its register map has no in_force")
+            return InForce(known_by, unverified, self._objections(await self._unit.snapshot(self._map.polled())))
 
     async def set_temperature(self, degC: float) -> None:
         """Send a set point and read it back.

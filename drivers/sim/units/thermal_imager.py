@@ -22,7 +22,7 @@ from thermostand.foundation.clock import NS_PER_S, to_ns
 # Writes radiometric JPEGs as a FLIR E40 stores them. Source: the public tag tables of ExifTool.
 #
 # Records in the order camera, palette, measurements, counts; 14 directory entries, the rest of them empty. The counts
-# are those of a surface of one emissivity that reflects a room of 20 degC, seen through no air: transmission 1.
+# are those of a surface of one emissivity that reflects surroundings of 20 degC, seen through no air: transmission 1.
 
 
 WIDTH, HEIGHT = 160, 120

@@ -153,7 +153,7 @@ class SettlingWatch:
             for reading in item.readings:
                 kept = self._readings.get(reading.channel)
                 if kept is not None and not _is_passing(reading, kept):
-                    is_suspect = reading.cause == "doubt"
+                    is_suspect = reading.cause == "suspect"
                     kept.extend((to_seconds(reading.time_ns), math.nan if is_suspect else reading.value))
                     if len(kept) > 4 * _KEPT:
                         del kept[: 2 * _KEPT]

@@ -183,8 +183,8 @@ class RunState:
 
     @property
     def soaked_s(self) -> dict[str, float]:
-        """The soak time so far in s (see earned_ns)."""
-        return {step_id: earned_ns / NS_PER_S for step_id, earned_ns in self.soaked_ns.items()}
+        """The soak time so far in s (see soaked_ns)."""
+        return {step_id: soaked_ns / NS_PER_S for step_id, soaked_ns in self.soaked_ns.items()}
 
     @property
     def size(self) -> dict[str, object]:

@@ -108,7 +108,7 @@ class Clients:
         self._is_open = True
 
     def take(self, door: str, connection: socket.socket) -> bool:
-        """Let one in, from any thread; whether there is room for it. door: "socket" or "tcp"."""
+        """Let one in, from any thread; whether there is a place for it. door: "socket" or "tcp"."""
         if not self._is_open or len(self._server.connections) + len(self._coming) >= MOST_CLIENTS:
             return False
         self._coming.add(connection)

@@ -30,8 +30,8 @@ class Interface:
 
     host, port: to listen at by TCP; no port, no TCP. hosts: names of this stand besides this machine's own.
     trusts_loopback: as `trust_loopback` of the stand's file. doors: other protocols' ports. sessions: the folder of
-    recorded sessions. rooms: makes what else is served (history, frames, the page) in the thread, as routers, by the
-    bridge.
+    recorded sessions. extra_routes: makes what else is served (history, frames, the page) in the thread, as routers, by
+    the bridge.
     """
 
     sessions: Path

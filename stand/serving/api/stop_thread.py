@@ -1,9 +1,9 @@
-"""The thread at the doors, which serves STOP, and does nothing else for anybody.
+"""The thread at the listening sockets, which serves STOP, and does nothing else for anybody.
 
 It accepts at the TCP port, at the Unix socket, and at another one for the command line's STOP. What a connection says
 first is looked at and left in the kernel: a request for STOP is answered here, without its body; every other connection
-is handed over as it is, once its head is there and there is room for it. Whatever the others do meanwhile, a STOP waits
-for this thread's turn only, which is a few system calls. A silent client makes room for the next.
+is handed over as it is, once its head has come and there is a place for it. Whatever others do meanwhile, a STOP waits
+for this thread's turn only, which is a few system calls. A silent client makes way for the next.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class _Client:
         self.has_answer = False
 
     def may_leave(self, now_s: float) -> bool:
-        """Whether it makes room for another; a STOP arrives as a whole, except from clients that drip."""
+        """Whether it makes way for another; a STOP arrives as a whole, except from clients that drip."""
         has_time = not self.has_spoken and now_s < self.came_s + _MAY_SPEAK_S
         return self.has_answer or not (self.answer is not None or self.waits or has_time)
 
@@ -102,8 +102,8 @@ class _Client:
 
 class StopThread:
     """From `start` to `end`; `listen`, `start` and `end` are for any thread. hand_over: is given who wants something
-    else, and returns whether there is room. `stopping` as that of the bridge; `failed` is called with what should not
-    happen."""
+    else, and returns whether there is a place. `stopping` as that of the bridge; `failed` is called with what should
+    not happen."""
 
     def __init__(self, stopping: Stopping, access: Access, failed: Callable[[Exception], None]) -> None:
         self.hand_over: Callable[[ListenerKind, socket.socket], bool] = lambda _door, _connection: False
@@ -203,7 +203,7 @@ class StopThread:
         self._epoll.register(listening, select.EPOLLIN)
 
     def _accept(self, door: ListenerKind, listening: socket.socket) -> None:
-        if not self._has_room(door):
+        if not self._admits(door):
             self._is_crowded = True
             return
         for _ in range(_AT_ONCE):
@@ -216,7 +216,7 @@ class StopThread:
             except OSError:  # no descriptor left, or no memory
                 if not is_readable(listening):
                     return
-                if self._make_room():
+                if self._free_descriptor():
                     continue
                 self._is_crowded = True
                 return
@@ -226,7 +226,7 @@ class StopThread:
             self._epoll.register(connection, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET)
             self._receive(client)  # it has mostly sent something by now
 
-    def _has_room(self, door: ListenerKind) -> bool:
+    def _admits(self, door: ListenerKind) -> bool:
         clients = [each for each in self._clients.values() if each.door == door and not each.waits]
         excess, now_s = len(clients) - _MOST_CLIENTS + 1, time.monotonic()
         if excess > 0:
@@ -237,7 +237,7 @@ class StopThread:
             excess -= len(leaving)
         return excess <= 0
 
-    def _make_room(self) -> bool:
+    def _free_descriptor(self) -> bool:
         """Whether there is a descriptor now, which there was not."""
         silent = [each for each in self._clients.values() if each.answer is None or each.has_answer]
         if silent:

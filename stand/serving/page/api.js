@@ -42,10 +42,10 @@ export function called(name, button, text = (title) => title, label = null) {
   return button;
 }
 
-// Orders the command of that name with what its argument takes; `said`: its label here. `place` gets the
+// Orders the command of that name with what its argument takes; `label`: what it is called here. `place` gets the
 // outcome; returns the answer, or null when it was refused.
-export async function order(place, name, given = {}, said = name) {
-  tell(place, `${said} …`);
+export async function order(place, name, given = {}, label = name) {
+  tell(place, `${label} …`);
   try {
     const { method, path } = name === "stop" ? STOP : (await commands()).get(name), body = { ...given };
     const at = path.slice(BASE.length).replace(/{(\w+)}/g, (_, field) => {
@@ -55,7 +55,7 @@ export async function order(place, name, given = {}, said = name) {
     });
     const answer = await send(method, at, Object.keys(body).length ? body : undefined);
     const moving = answer.moving?.length ? `; still moving: ${answer.moving.join(", ")}` : "";
-    tell(place, (answer.text || `${said}: done`) + moving);
+    tell(place, (answer.text || `${label}: done`) + moving);
     return answer;
   } catch (error) {
     tell(place, error instanceof Refused ? error.message : `the stand could not be reached (${error.message})`, true);

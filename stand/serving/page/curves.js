@@ -206,9 +206,9 @@ export class Curves {
 }
 
 // A name that is too long keeps its beginning and its end, in which names of one kind differ.
-function fitting(context, name, room) {
+function fitting(context, name, width) {
   let text = name;
-  for (let kept = name.length - 1; kept > 1 && context.measureText(text).width > room; kept -= 1) {
+  for (let kept = name.length - 1; kept > 1 && context.measureText(text).width > width; kept -= 1) {
     const half = Math.ceil(kept / 2);
     text = `${name.slice(0, half)}…${name.slice(name.length - kept + half)}`;
   }
@@ -231,7 +231,7 @@ function times(_, ticks, _axis, _space, step_s) {
 function padded(plot, low, high) {
   plot.is_empty = low === null || high === null; // an axis of nothing has no numbers
   if (plot.is_empty) return [0, 1];
-  const room = Math.max((high - low) * 0.08, 0.05), least = plot.series.length > 6 ? 2 : 0.02;
+  const margin = Math.max((high - low) * 0.08, 0.05), least = plot.series.length > 6 ? 2 : 0.02;
   const more = Math.max(0, least - (high - low)) / 2;
-  return [low - room - more, high + room + more];
+  return [low - margin - more, high + margin + more];
 }

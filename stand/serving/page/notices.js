@@ -10,8 +10,8 @@ const REASON = {
 };
 const ENDS = {
   camera_lost: "It goes on when the camera answers: look at its cable and supply.",
-  disk_low: "It goes on when there is room: stand session archive copies what is finished elsewhere.",
-  not_recorded: "It goes on when the disk takes what waits: see that it is there, has room and answers.",
+  disk_low: "It goes on when there is space: stand session archive copies what is finished elsewhere.",
+  not_recorded: "It goes on when the disk takes what waits: see that it is mounted, has space and answers.",
 };
 // What the guard does about a fault: FaultState.data of a rule of the stand.
 const DOES = {

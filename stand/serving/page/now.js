@@ -47,7 +47,7 @@ export class Now {
     this.events = h("ul", {});
     this.frame_place = h("div", { class: "stack last" });
     fill(place, h("div", { class: "grid now" },
-      h("div", { class: "stack aside" },
+      h("div", { class: "stack side-panel" },
         h("section", { class: "panel" }, h("h2", {}, "Readings"),
           h("div", { class: "scroll" }, h("table", { class: "readings" },
             h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "press to hide a curve"), h("th", { scope: "col", class: "number" }, "now"), h("th", { scope: "col", class: "number" }, "per h"))),

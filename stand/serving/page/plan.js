@@ -152,7 +152,7 @@ export class Plan {
     for (const step of steps) {
       const x = (at_s / total_s) * width, wide = Math.max(1, (step.duration_s / total_s) * width);
       const is_frames = step.kind.startsWith("capture"), is_soak = step.kind.startsWith("soak") || step.kind === "cool_down";
-      const part = { done: 1, skipped: 0, waiting: 0, under_way: earned(step) }[step.standing];
+      const part = { done: 1, skipped: 0, waiting: 0, under_way: soaked_share(step) }[step.standing];
       const top = is_frames ? 4 * scale : is_soak ? 12 * scale : 18 * scale, tall = height - 2 * top;
       context.fillStyle = is_frames ? `${css("--c-air")}88` : css("--line");
       context.fillRect(x, top, wide, tall);
@@ -173,13 +173,13 @@ export class Plan {
   close() { this.closed = true; this.editor?.close(); clearInterval(this.timer); clearTimeout(this.later); this.resizing.disconnect(); }
 }
 
-const earned = (step) => {
+const soaked_share = (step) => {
   if (step.frames) return Math.min(1, step.frames_saved / step.frames);
   return step.duration_s > 0 ? Math.min(1, step.soaked_s / step.duration_s) : 0;
 };
 
 function bar(step) {
-  return h("progress", { max: 1, value: earned(step), "aria-label": `${number(earned(step) * 100, 0)} % of step ${step.index + 1}` });
+  return h("progress", { max: 1, value: soaked_share(step), "aria-label": `${number(soaked_share(step) * 100, 0)} % of step ${step.index + 1}` });
 }
 
 function progress_text(step) {

@@ -60,10 +60,10 @@ export class Sessions {
     const troubles = [...(each.troubles ?? []), ...(each.missing ?? [])];
     return h("tr", {}, h("td", {}, box),
       h("td", {}, each.name, each.simulated ? " " : "", each.simulated ? h("span", { class: "tag" }, "simulated") : null, ...(each.tags ?? []).flatMap((tag) => [" ", h("span", { class: "tag" }, tag)]),
-        (each.notes ?? []).map((note) => h("small", { class: "said" }, `${note.by ? `${note.by}: ` : ""}${note.text ?? note}`))),
+        (each.notes ?? []).map((note) => h("small", { class: "note-text" }, `${note.by ? `${note.by}: ` : ""}${note.text ?? note}`))),
       h("td", {}, each.recipe), h("td", {}, begun_ns(each) ? dated_clock(seconds(begun_ns(each))) : "–"), h("td", { class: "number" }, took),
       h("td", { class: "number" }, String(each.frames)), h("td", { class: "number" }, bytes(each.bytes ?? 0)), h("td", {}, each.run),
-      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files, each.copies ? h("small", { class: "said" }, each.copies.length ? "archived" : "not archived") : null), h("td", {}, actions));
+      h("td", { title: troubles.join("\n"), class: troubles.length ? "level-error" : "" }, each.files, each.copies ? h("small", { class: "note-text" }, each.copies.length ? "archived" : "not archived") : null), h("td", {}, actions));
   }
 
   note(each, place) {
@@ -93,10 +93,10 @@ export class Sessions {
     const names = [...this.chosen];
     tell(this.answer, `reading ${names.join(" and ")} …`);
     try {
-      const nights = await Promise.all(names.map((name) => get(`/sessions/${encodeURIComponent(name)}/history?points=1000`)));
+      const histories = await Promise.all(names.map((name) => get(`/sessions/${encodeURIComponent(name)}/history?points=1000`)));
       if (this.closed) return;
       tell(this.answer, "");
-      this.draw(names, nights);
+      this.draw(names, histories);
     } catch (error) { tell(this.answer, error.message, true); return; }
     for (const [index, name] of names.entries()) this.find_drift(name, index, names);
   }
@@ -114,10 +114,10 @@ export class Sessions {
     } catch (error) { tell(place, `${name}: ${error.message}`, true); }
   }
 
-  draw(names, nights) {
+  draw(names, histories) {
     this.clear();
     this.shown_names = names;
-    this.nights = nights;
+    this.histories = histories;
     this.drift = names.map(() => ({ points: [] }));
     this.comparison.hidden = false;
     const place = h("div", { class: "curve", role: "img", "aria-label": `Temperatures of ${names.join(" and ")} over the hours since their beginnings` });
@@ -128,9 +128,9 @@ export class Sessions {
       h("button", { type: "button", class: "small", onclick: () => { this.clear(); this.comparison.hidden = true; } }, "Close")), key,
       h("p", { class: "curve-name row" }, "°C: ", COMPARED.map(([channel, colour]) => h("span", { class: "row" }, swatch({ colour, dash: [], width: 2 }), look_of(channel).name))), place, h("p", { class: "curve-name" }, "Mean drift, px"), drift, this.drift_answers);
     this.drift_place = drift;
-    const series = nights.flatMap((night, index) => COMPARED.filter(([channel]) => night.low[channel]).map(([channel, colour]) => ({
+    const series = histories.flatMap((history, index) => COMPARED.filter(([channel]) => history.low[channel]).map(([channel, colour]) => ({
       name: `${look_of(channel).name}, ${names[index]}`, colour, dash: index ? [6, 4] : [],
-      x: hours(night), y: night.high[channel] ?? night.low[channel] })));
+      x: hours(history), y: history.high[channel] ?? history.low[channel] })));
     this.plots.push(new Lines(place, 280, series));
     this.draw_drift();
     this.comparison.scrollIntoView({ block: "start" });
@@ -140,7 +140,7 @@ export class Sessions {
     this.drift_plot?.destroy();
     const series = this.drift.map((drift, index) => ({
       name: this.shown_names[index], colour: index ? "--c-worst" : "--c-mean", dash: index ? [6, 4] : [],
-      x: drift.points.map((point) => (point.time_ns - this.nights[index].from_ns) / 3600e9), y: drift.points.map((point) => point.mean_px) }));
+      x: drift.points.map((point) => (point.time_ns - this.histories[index].from_ns) / 3600e9), y: drift.points.map((point) => point.mean_px) }));
     this.drift_plot = series.some((each) => each.x.length) ? new Lines(this.drift_place, 200, series) : null;
   }
 
@@ -164,7 +164,7 @@ function begun_ns(each) {
   return at && Date.parse(`${at[1]}-${at[2]}-${at[3]}T${at[4]}:${at[5]}:${at[6]}Z`) * 1e6;
 }
 
-const hours = (night) => Array.from({ length: night.points }, (_, n) => ((n + 0.5) * night.width_ns) / 3600e9);
+const hours = (history) => Array.from({ length: history.points }, (_, n) => ((n + 0.5) * history.width_ns) / 3600e9);
 
 // Lines that do not share their x.
 class Lines {

@@ -31,9 +31,9 @@ async def test_a_disk_that_hangs_keeps_neither_the_interface_nor_the_process(mon
 async def test_sessions_and_their_reports_are_read_and_links_are_not_followed(tmp_path: Path):
     folder, port = tmp_path / "sessions", free_port()
     folder.mkdir()
-    await record(folder / "night")
-    (folder / "night" / REPORT).write_text("<style>p {}</style><p>20 K")
-    (folder / "linked").symlink_to(folder / "night")
+    await record(folder / "cycle")
+    (folder / "cycle" / REPORT).write_text("<style>p {}</style><p>20 K")
+    (folder / "linked").symlink_to(folder / "cycle")
     await record(tmp_path / "outside")
     (folder / "away").mkdir()
     (folder / "away" / "telemetry").symlink_to(tmp_path / "outside" / "telemetry")
@@ -41,12 +41,12 @@ async def test_sessions_and_their_reports_are_read_and_links_are_not_followed(tm
     async def get(path: str) -> tuple[int, dict[str, str], bytes]:
         return await asyncio.to_thread(ask, port, "GET", f"/api/v1{path}")
 
-    async with serve_fake(FakeService(), tmp_path / "night", Interface(folder, port=port)):
+    async with serve_fake(FakeService(), tmp_path / "cycle", Interface(folder, port=port)):
         listed = json.loads((await get("/sessions"))[2])
-        night = next(entry for entry in listed if entry["name"] == "night")
-        assert (night["frames"], night["files"], night["has_report"]) == (12, "sound", True)
-        assert json.loads((await get("/sessions/night"))[2]) == night
-        status, headers, text = await get("/sessions/night/report.html")
+        found = next(entry for entry in listed if entry["name"] == "cycle")
+        assert (found["frames"], found["files"], found["has_report"]) == (12, "sound", True)
+        assert json.loads((await get("/sessions/cycle"))[2]) == found
+        status, headers, text = await get("/sessions/cycle/report.html")
         assert (status, text) == (200, b"<style>p {}</style><p>20 K")
         assert headers["content-security-policy"] == REPORT_CSP
         assert (await get("/sessions/linked/report.html"))[0] == 404
@@ -57,7 +57,7 @@ async def test_sessions_and_their_reports_are_read_and_links_are_not_followed(tm
         assert json.loads((await get("/recipes/schema"))[2])["title"] == "Recipe"
 
 
-async def test_without_a_folder_there_are_no_sessions(tmp_path: Path):
+async def test_without_a_folder_no_sessions_are_listed(tmp_path: Path):
     port = free_port()
-    async with serve_fake(FakeService(), tmp_path / "night", Interface(tmp_path / "nowhere", port=port)):
+    async with serve_fake(FakeService(), tmp_path / "cycle", Interface(tmp_path / "nowhere", port=port)):
         assert (await asyncio.to_thread(ask, port, "GET", "/api/v1/sessions"))[2] == b"[]"

@@ -18,7 +18,7 @@ from thermostand.stand.service.run import run_virtual
 
 OFFSET_K = 10.0
 RECIPE = """
-name: doubted
+name: suspect
 experiments:
   - thermal_cycle:
       table_position: {linear: 2, rotary: 1}
@@ -59,14 +59,14 @@ async def test_frames_of_a_camera_that_is_wrong_at_each_capture_say_so(tmp_path:
     columns, rows = make_frames_rows(session, None)
     place = [column.name for column in columns].index("flags")
     assert Counter(row[place] for row in rows)[TEMPERATURE_SUSPECT] == count
-    said = Counter(event.kind for event in session.events() if "channels" in event.data)
-    assert said == {"guard.sensor_jumped": len(captures) - 1, "sensor_believed": len(captures) - 1}
+    kinds = Counter(event.kind for event in session.events() if "channels" in event.data)
+    assert kinds == {"guard.sensor_jumped": len(captures) - 1, "sensor_believed": len(captures) - 1}
     wrong_ns = {
         each.time_ns
         for item in session.items()
         if isinstance(item, Batch)
         for each in item.readings
-        if each.channel == "camera.temperature" and each.quality is Quality.STALE and each.cause == "doubt"
+        if each.channel == "camera.temperature" and each.quality is Quality.STALE and each.cause == "suspect"
     }
     assert (
         set(session.readings("camera.temperature")[0].tolist())

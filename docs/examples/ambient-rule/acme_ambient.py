@@ -10,7 +10,7 @@ from thermostand.stand.safety.fault import Fault, Readings, Watch, get_value
 
 
 class Settings(Document):
-    """Its keys below `guard.added.room_hot` of a stand's file."""
+    """Its keys below `guard.added.ambient_hot` of a stand's file."""
 
     limit_degC: float = Field(default=30.0, le=40)
     for_s: float = Field(default=0.0, ge=0)
@@ -22,10 +22,10 @@ def watches(settings: Settings, config: Any) -> list[Watch]:
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         value_degC = get_value(readings, "thermometers.laboratory")
         if value_degC > settings.limit_degC:
-            return Fault("room_hot", f"the room of {config.name} is {value_degC:.1f} degC")
+            return Fault("ambient_hot", f"the laboratory of {config.name} is {value_degC:.1f} degC")
         return None
 
     return [Watch(rule, settings.for_s, "hold")]
 
 
-RULE = GuardRule("room_hot", "the laboratory is too warm", Settings, watches, "open a window")
+RULE = GuardRule("ambient_hot", "the laboratory is too warm", Settings, watches, "open a window")

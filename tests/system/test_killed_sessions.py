@@ -1,4 +1,4 @@
-"""A night that is killed every 20 s of real time until it ends, also while it is being resumed and salvaged."""
+"""A session that is killed every 20 s of real time until it ends, also while it is being resumed and salvaged."""
 
 import random
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from thermostand.stand.running.order import Order
 LIFE_S = 20.0
 SET_POINTS = [30, 20, 24, 32, 20, 28, 22, 34, 26, 20, 30, 24] * 4
 # A dwell fits into one life also on a machine that others load: a chamber that was left alone has to soak again.
-NIGHT = (
+RECIPE = (
     SHORT_RECIPE.replace("600", "300")
     .replace("[30, 20, 24]", str(SET_POINTS))
     .replace("frames_per_point: 1", "frames_per_point: 6")
@@ -25,10 +25,10 @@ NIGHT = (
 
 
 @pytest.mark.nightly
-def test_a_night_killed_every_20_s_of_real_time_comes_to_its_end_and_loses_nothing(
+def test_a_session_killed_every_20_s_of_real_time_comes_to_its_end_and_loses_nothing(
     tmp_path: Path, order: Callable[..., Order]
 ):
-    ordered, out, rng = order(NIGHT), tmp_path / "out", random.Random(20)
+    ordered, out, rng = order(RECIPE), tmp_path / "out", random.Random(20)
     acknowledged, unresumed, lives = list[int](), 0, 1
     daemon = Daemon(ordered, out)
     while not is_over(daemon, LIFE_S, out):
@@ -51,7 +51,7 @@ def test_a_night_killed_every_20_s_of_real_time_comes_to_its_end_and_loses_nothi
 
 
 def is_over(daemon: Daemon, real_s: float, out: Path) -> bool:
-    """Whether the night came to its end within that time; else the daemon is killed. It may also be killed just after
+    """Whether the session came to its end within that time; else the daemon is killed. It may also be killed just after
     the end was written."""
     if daemon.ends_within(real_s):
         return True

@@ -19,7 +19,7 @@ Left = namedtuple("Left", "folder part written")
 @pytest.fixture(params=SERIES)
 def left(request, tmp_path):
     """A segment of twenty blocks that was not finished."""
-    folder: Path = tmp_path / "night" / request.param
+    folder: Path = tmp_path / "cycle" / request.param
     written = write_segment(folder, request.param, range(COUNT))
     return Left(folder, folder / "0000.mcap.part", written)
 
@@ -70,7 +70,7 @@ def test_zeros_over_the_last_block_are_what_a_power_cut_leaves(left, into):
     assert names(left.folder) == ["0000.mcap"]
 
 
-def test_the_first_block_may_be_torn_like_any_other(left):
+def test_the_first_block_may_be_partial_like_any_other(left):
     first = left.written.blocks[0]
     other = FRAMES if left.written.series == TELEMETRY else TELEMETRY
     write_segment(left.folder.parent / other, other, range(3), finish=True)
@@ -82,7 +82,7 @@ def test_the_first_block_may_be_torn_like_any_other(left):
 
 
 @pytest.mark.parametrize("behind_head", [0, 200])
-def test_a_block_larger_than_all_before_is_torn_as_far_as_its_head_tells(left, tmp_path, behind_head):
+def test_a_block_larger_than_all_before_is_partial_as_far_as_its_head_tells(left, tmp_path, behind_head):
     small = write_segment(tmp_path / "small" / left.written.series, left.written.series, range(3))
     block = left.written.blocks[0]  # with the schemas
     larger = zeros_from(left.written.data[block.begin : block.end], 9 + behind_head)

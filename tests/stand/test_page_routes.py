@@ -1,4 +1,4 @@
-"""The routes of the page, asked as a browser asks them: its files, curves, frames, recorded nights."""
+"""The routes of the page, asked as a browser asks them: its files, curves, frames, recorded sessions."""
 
 import asyncio
 import json
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
 @asynccontextmanager
-async def served_night(folder):
+async def serve_session(folder):
     port = free_port()
     async with serve_cycle(folder, port) as desk:
         desk.port, desk.folder = port, folder
@@ -30,16 +30,16 @@ async def served_night(folder):
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def night(tmp_path_factory):
-    """For tests that only read it, and add recorded nights of their own names."""
-    async with served_night(tmp_path_factory.mktemp("night") / "sessions") as desk:
+async def recorded(tmp_path_factory):
+    """For tests that only read it, and add recorded sessions of their own names."""
+    async with serve_session(tmp_path_factory.mktemp("cycle") / "sessions") as desk:
         yield desk
 
 
 @pytest_asyncio.fixture(loop_scope="module")
-async def own_night(tmp_path, compiled_fit):
+async def own_session(tmp_path, compiled_fit):
     """For tests that look at frames."""
-    async with served_night(tmp_path / "sessions") as desk:
+    async with serve_session(tmp_path / "sessions") as desk:
         yield desk
 
 
@@ -56,13 +56,13 @@ async def ask(desk, path):
     return await asyncio.to_thread(_read, f"http://127.0.0.1:{desk.port}{path}")
 
 
-async def test_the_page_is_whole_and_lets_nothing_in_from_elsewhere(night):
-    status, headers, text = await ask(night, "/")
+async def test_the_page_is_whole_and_lets_nothing_in_from_elsewhere(recorded):
+    status, headers, text = await ask(recorded, "/")
     assert status == 200
     assert "script-src 'self'" in headers["content-security-policy"]
     assert "unsafe" not in headers["content-security-policy"]
     for path in PAGE.iterdir():
-        found, _, data = await ask(night, f"/static/{path.name}")
+        found, _, data = await ask(recorded, f"/static/{path.name}")
         assert (found, data) == (200, path.read_bytes())
     assert b"<style" not in text
     assert b"style=" not in text
@@ -89,16 +89,18 @@ async def test_each_reason_to_hold_has_its_words():
 @pytest.mark.parametrize(
     "name", ["../page_routes.py", "..%2Fpage_routes.py", "%2e%2e%2fapi_models.py", "nothing.js", ".", "%00"]
 )
-async def test_no_other_file_is_given(night, name):
-    status, _, data = await ask(night, f"/static/{name}")
+async def test_no_other_file_is_given(recorded, name):
+    status, _, data = await ask(recorded, f"/static/{name}")
     assert status in (400, 404)
     assert "error" in json.loads(data)
 
 
-async def test_curves_of_the_night_are_given_decimated(night):
-    to_ns = night.clock.now_ns()
-    path = f"/api/v1/history?from_ns={night.began_ns}&to_ns={to_ns}&points=300&channels=thermometers.air,regulator.sp"
-    status, _, data = await ask(night, path)
+async def test_curves_of_the_session_are_given_decimated(recorded):
+    to_ns = recorded.clock.now_ns()
+    path = (
+        f"/api/v1/history?from_ns={recorded.began_ns}&to_ns={to_ns}&points=300&channels=thermometers.air,regulator.sp"
+    )
+    status, _, data = await ask(recorded, path)
     found = json.loads(data)
     assert status == 200
     assert set(found["low"]) == {"thermometers.air", "regulator.sp"}
@@ -111,51 +113,51 @@ async def test_curves_of_the_night_are_given_decimated(night):
 @pytest.mark.parametrize(
     "query", ["from_ns=5&to_ns=5", "from_ns=9&to_ns=5", "from_ns=0&to_ns=5&points=0", "to_ns=5", "from_ns=a&to_ns=1"]
 )
-async def test_what_is_no_time_is_reported_in_a_sentence(night, query):
-    status, _, data = await ask(night, f"/api/v1/history?{query}")
+async def test_what_is_no_time_is_reported_in_a_sentence(recorded, query):
+    status, _, data = await ask(recorded, f"/api/v1/history?{query}")
     assert status == 422
     assert json.loads(data)["error"]
 
 
-async def test_before_the_first_frame_there_is_none_and_then_there_is(own_night):
-    assert (await ask(own_night, "/api/v1/frame"))[0] == 204
-    assert (await ask(own_night, "/api/v1/frame.jpg"))[0] == 204
-    time_ns = own_night.clock.now_ns()
-    own_night.hub.publish(frame_of(target_image(0, 0), time_ns))
+async def test_before_the_first_frame_none_is_given_and_then_it_is(own_session):
+    assert (await ask(own_session, "/api/v1/frame"))[0] == 204
+    assert (await ask(own_session, "/api/v1/frame.jpg"))[0] == 204
+    time_ns = own_session.clock.now_ns()
+    own_session.hub.publish(frame_of(target_image(0, 0), time_ns))
     async with asyncio.timeout(120):
-        while (await ask(own_night, "/api/v1/frame"))[0] == 204:
+        while (await ask(own_session, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)
-    status, _, data = await ask(own_night, "/api/v1/frame?camera=camera")
+    status, _, data = await ask(own_session, "/api/v1/frame?camera=camera")
     found = json.loads(data)
     assert (status, found["time_ns"], len(found["markers"]), found["mean_px"]) == (200, time_ns, 54, 0.0)
-    status, headers, picture = await ask(own_night, "/api/v1/frame.jpg")
+    status, headers, picture = await ask(own_session, "/api/v1/frame.jpg")
     assert (status, headers["content-type"], picture[:2]) == (200, "image/jpeg", b"\xff\xd8")
     assert headers["cache-control"] == "no-store"
-    assert (await ask(own_night, "/api/v1/frame?camera=other"))[0] == 404
+    assert (await ask(own_session, "/api/v1/frame?camera=other"))[0] == 404
 
 
-async def test_a_recipe_is_given_as_a_document(night):
-    status, _, data = await ask(night, "/api/v1/recipes/overnight")
+async def test_a_recipe_is_given_as_a_document(recorded):
+    status, _, data = await ask(recorded, "/api/v1/recipes/overnight")
     assert status == 200
     assert json.loads(data)["experiments"][1]["calibration"]["linear_mm"][0] == 0
     for name in ("..%2Fsimulated", "nothing", "Overnight", "%20"):
-        assert (await ask(night, f"/api/v1/recipes/{name}"))[0] == 404
+        assert (await ask(recorded, f"/api/v1/recipes/{name}"))[0] == 404
 
 
-async def test_a_recorded_night_gives_its_curves(night):
-    await record(night.folder / "one night", 12)
-    status, _, data = await ask(night, f"/api/v1/sessions/{urllib.parse.quote('one night')}/history?points=100")
+async def test_a_recorded_session_gives_its_curves(recorded):
+    await record(recorded.folder / "one night", 12)
+    status, _, data = await ask(recorded, f"/api/v1/sessions/{urllib.parse.quote('one night')}/history?points=100")
     found = json.loads(data)
     assert status == 200
     assert max(value for value in found["low"]["regulator.pv"] if value is not None) >= 31
-    assert (await ask(night, "/api/v1/sessions/another/history"))[0] == 404
-    shutil.rmtree(night.folder / "one night" / "telemetry")
-    status, _, data = await ask(night, f"/api/v1/sessions/{urllib.parse.quote('one night')}/history")
+    assert (await ask(recorded, "/api/v1/sessions/another/history"))[0] == 404
+    shutil.rmtree(recorded.folder / "one night" / "telemetry")
+    status, _, data = await ask(recorded, f"/api/v1/sessions/{urllib.parse.quote('one night')}/history")
     assert status in (404, 409)
 
 
 @pytest.mark.usefixtures("compiled_fit")
-async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
+async def test_the_drift_of_a_recorded_session_is_the_true_one(recorded):
     """Eight frames to fit after a reference; the target moves by 0.2 px a frame."""
 
     def items(time_ns, index):
@@ -165,8 +167,8 @@ async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
         yield frame_of(target_image(0, 0.2 * index, (612, 512)), time_ns, f"c{index}")
         yield StepMark(time_ns, f"c{index}", index, "capture", StepState.DONE, parameters)
 
-    await record(night.folder / "night", 9, items, attachments={"target.yaml": TARGET})
-    status, _, data = await ask(night, "/api/v1/sessions/night/drift")
+    await record(recorded.folder / "cycle", 9, items, attachments={"target.yaml": TARGET})
+    status, _, data = await ask(recorded, "/api/v1/sessions/cycle/drift")
     found = json.loads(data)
     assert (status, found["camera"], found["trouble"]) == (200, "camera", "")
     means = [point["mean_px"] for point in found["points"]]
@@ -174,35 +176,35 @@ async def test_the_drift_of_a_recorded_night_is_the_true_one(night):
     assert found["points"][0]["time_ns"] < found["points"][-1]["time_ns"]
 
 
-async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(own_night):
+async def test_a_process_that_ends_is_a_warning_and_the_curves_go_on(own_session):
     events = []
-    own_night.hub.subscribe(lambda item: isinstance(item, Event) and events.append(item))
-    own_night.hub.publish(frame_of(target_image(0, 0), own_night.clock.now_ns()))
+    own_session.hub.subscribe(lambda item: isinstance(item, Event) and events.append(item))
+    own_session.hub.publish(frame_of(target_image(0, 0), own_session.clock.now_ns()))
     async with asyncio.timeout(120):
-        while (await ask(own_night, "/api/v1/frame"))[0] == 204:
+        while (await ask(own_session, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)
-    own_night.viewing._helper._process.kill()
-    own_night.hub.publish(frame_of(target_image(0, 0), own_night.clock.now_ns()))
+    own_session.viewing._helper._process.kill()
+    own_session.hub.publish(frame_of(target_image(0, 0), own_session.clock.now_ns()))
     async with asyncio.timeout(30):
         while not [event for event in events if event.kind == "preview"]:
             await asyncio.sleep(0.05)
     (reported,) = [event for event in events if event.kind == "preview"]
     assert reported.level == "warning"
     assert "killed by SIGKILL" in reported.text or "has ended" in reported.text
-    curves = f"/api/v1/history?from_ns={own_night.began_ns}&to_ns={own_night.clock.now_ns()}"
-    assert (await ask(own_night, curves))[0] == 200
-    assert (await ask(own_night, "/api/v1/frame"))[0] == 200  # the last one stays
+    curves = f"/api/v1/history?from_ns={own_session.began_ns}&to_ns={own_session.clock.now_ns()}"
+    assert (await ask(own_session, curves))[0] == 200
+    assert (await ask(own_session, "/api/v1/frame"))[0] == 200  # the last one stays
 
 
-async def test_frames_are_skipped_and_never_queued(own_night):
+async def test_frames_are_skipped_and_never_queued(own_session):
     """A hundred at once: the newest is what is looked at."""
-    time_ns = own_night.clock.now_ns()
+    time_ns = own_session.clock.now_ns()
     for frame in [frame_of(target_image(0, 0, (612, 512)), time_ns + index) for index in range(100)]:
-        own_night.hub.publish(frame)
+        own_session.hub.publish(frame)
     async with asyncio.timeout(120):
-        while (answer := await ask(own_night, "/api/v1/frame"))[0] == 204:
+        while (answer := await ask(own_session, "/api/v1/frame"))[0] == 204:
             await asyncio.sleep(0.2)
         while (found := json.loads(answer[2]))["time_ns"] != time_ns + 99:
-            answer = await ask(own_night, "/api/v1/frame")
+            answer = await ask(own_session, "/api/v1/frame")
             await asyncio.sleep(0.1)
     assert found["skipped"] >= 97
