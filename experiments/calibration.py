@@ -27,11 +27,19 @@ from thermostand.experiments.steps import CloseFlap, Role, StartChamber, Step, S
 class CalibrationGrid(MovingTable, Guaranteed):
     """Parameters of a calibration."""
 
-    reference_degC: Chamber_degC = 24.0
-    equilibrium_s: Wait_s = 2700.0
-    linear_mm: tuple[Linear_mm, ...] = Field(min_length=1, max_length=100)
-    rotary_deg: tuple[Rotary_deg, ...] = Field(min_length=1, max_length=100)
-    left_out: tuple[TablePosition, ...] = Field(default=(), max_length=1000)
+    reference_degC: Chamber_degC = Field(default=24.0, description="The set-point throughout.")
+    equilibrium_s: Wait_s = Field(
+        default=2700.0, description="The soak at the reference, with the camera on, before the first frames."
+    )
+    linear_mm: tuple[Linear_mm, ...] = Field(
+        min_length=1, max_length=100, description="Positions of the linear stage; each with every rotary position."
+    )
+    rotary_deg: tuple[Rotary_deg, ...] = Field(
+        min_length=1, max_length=100, description="Positions of the rotary stage."
+    )
+    left_out: tuple[TablePosition, ...] = Field(
+        default=(), max_length=1000, description="Pairs of positions that are not visited."
+    )
 
     @model_validator(mode="after")
     def _check_positions(self) -> Self:

@@ -26,8 +26,8 @@ Rotary_deg = Annotated[float, Field(ge=-360, le=360)]
 class CaptureParameters(Document):
     """How every experiment takes its frames."""
 
-    interval_s: float = Field(default=0.5, gt=0, le=86400)
-    exposure_s: float = Field(default=0.1, gt=0, le=10)
+    interval_s: float = Field(default=0.5, gt=0, le=86400, description="From one frame to the next.")
+    exposure_s: float = Field(default=0.1, gt=0, le=10, description="Exposure of each frame.")
 
     @model_validator(mode="after")
     def _check_exposure(self) -> Self:
@@ -39,14 +39,24 @@ class CaptureParameters(Document):
 class Guaranteed(Document):
     """How near to its set-point the chamber has to be before frames are taken there; see steps.Soak."""
 
-    band_K: float = Field(default=SOAK_BAND_K, ge=0, le=20)
-    unsettled: OnUnsettled = "mark"
+    band_K: float = Field(
+        default=SOAK_BAND_K,
+        ge=0,
+        le=20,
+        description="How near to the set-point the air has to stay in a soak's last part.",
+    )
+    unsettled: OnUnsettled = Field(
+        default="mark",
+        description="When a soak's longest time is over outside the band: mark the frames, or hold the run.",
+    )
 
 
 class StillTable(CaptureParameters):
     """An experiment with the target in one place: axis -> mm or deg."""
 
-    table_position: dict[str, float] = Field(default_factory=dict)
+    table_position: dict[str, float] = Field(
+        default_factory=dict, description="Where each axis of the table holds the target."
+    )
 
 
 class Settled(Document):
@@ -55,14 +65,19 @@ class Settled(Document):
     The drift decides: it is seen to some 0.1 mpx/min, while cameras give their temperature in digits of 0.1 to 0.5 K.
     """
 
-    min_s: Wait_s = 600.0
-    window_s: float = Field(default=600.0, ge=60, le=3600)
-    look_every_s: float = Field(default=120.0, ge=20, le=900)  # the flap alone takes 6 s there and back
+    min_s: Wait_s = Field(default=600.0, description="The shortest soak.")
+    window_s: float = Field(default=600.0, ge=60, le=3600, description="The time over which the rates are judged.")
+    # The flap alone takes 6 s there and back.
+    look_every_s: float = Field(default=120.0, ge=20, le=900, description="From one look at the target to the next.")
     # On 10 drawn cameras these rates save 10 % of the soaks in the median (0 to 46), twice the rates 34 %, and the
     # thermal form leaves 1.00 and 1.25 times what it does after full soaks (2.6 and 4.3 in the worst): a slow part
     # moves less than noise.
-    camera_K_per_min: float = Field(default=0.2, gt=0, le=10)
-    drift_px_per_min: float = Field(default=0.003, gt=0, le=10)
+    camera_K_per_min: float = Field(
+        default=0.2, gt=0, le=10, description="The camera is settled when its temperature changes no faster."
+    )
+    drift_px_per_min: float = Field(
+        default=0.003, gt=0, le=10, description="The image is settled when it drifts no faster."
+    )
 
     @model_validator(mode="after")
     def _check_looks(self) -> Self:
@@ -160,5 +175,5 @@ class TablePosition(Document):
 class MovingTable(CaptureParameters):
     """An experiment that moves the target; `settle_s` after each move the table has stopped ringing."""
 
-    settle_s: Wait_s = 5.0
-    frames_per_position: FrameCount = 5
+    settle_s: Wait_s = Field(default=5.0, description="After each move, until the table is at rest.")
+    frames_per_position: FrameCount = Field(default=5, description="Frames at each position.")

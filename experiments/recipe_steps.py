@@ -57,18 +57,18 @@ class Nothing(Document):
 class RepeatEntry(Document):
     """The same steps `times` times."""
 
-    times: int = Field(ge=1, le=10_000)
-    steps: StepEntries = Field(min_length=1)
+    times: int = Field(ge=1, le=10_000, description="How often.")
+    steps: StepEntries = Field(min_length=1, description="What is repeated.")
 
 
 class RampEntry(Document):
     """The set-point goes from where it is to `to_degC`, by `rate_K_per_min`: a new set-point every `every_K`, a soak
     that keeps the rate, then `steps`."""
 
-    to_degC: Chamber_degC
-    rate_K_per_min: float = Field(gt=0, le=20)
-    every_K: float = Field(default=1.0, ge=0.1, le=80)
-    steps: StepEntries = ()
+    to_degC: Chamber_degC = Field(description="Where the ramp ends.")
+    rate_K_per_min: float = Field(gt=0, le=20, description="How fast the set-point goes.")
+    every_K: float = Field(default=1.0, ge=0.1, le=80, description="From one set-point of the ramp to the next.")
+    steps: StepEntries = Field(default=(), description="What is done at each of them.")
 
     def set_points(self, from_degC: float) -> Iterator[tuple[float, float]]:
         """Each set-point, degC, and the soak after it, s."""

@@ -358,14 +358,16 @@ _OPEN_S = 60.0  # of a soak through an open flap: the laboratory's air comes in
 
 
 class _Timed(Document):
-    duration_s: Wait_s
+    duration_s: Wait_s = Field(description="The time of the soak.")
 
 
 class SoakEntry(Guaranteed, _Timed):
     """A guaranteed soak, as the step Soak."""
 
-    last_s: Wait_s | None = None
-    max_s: Wait_s | None = None
+    last_s: Wait_s | None = Field(
+        default=None, description="The last part, in which the chamber has to stay in its band; empty for a third."
+    )
+    max_s: Wait_s | None = Field(default=None, description="The longest soak; empty for twice its time.")
 
     @model_validator(mode="after")
     def _check_possible(self) -> Self:
@@ -635,10 +637,12 @@ class CaptureEntry(CaptureParameters):
     chamber_degC: only while the chamber is stopped, the temperature they are made at; else it is the set-point of the
     steps before. cameras: the names of those that expose, by default all of the stand."""
 
-    frames: FrameCount = 1
-    role: Role = Role.OTHER
-    chamber_degC: Chamber_degC | None = None
-    cameras: tuple[str, ...] = ()
+    frames: FrameCount = Field(default=1, description="How many.")
+    role: Role = Field(default=Role.OTHER, description="What they are for; nothing is fitted to `other` ones.")
+    chamber_degC: Chamber_degC | None = Field(
+        default=None, description="At which temperature they are made, only while the chamber is stopped."
+    )
+    cameras: tuple[str, ...] = Field(default=(), description="Those that expose, by name; empty for all.")
 
     @model_validator(mode="after")
     def _check_purpose(self) -> Self:
@@ -777,9 +781,11 @@ COOL_DOWN_AS_FOUND = "cool down as found"  # of a camera that the run finds as w
 class CoolDownEntry(Document):
     """The entry of a recipe for the step CoolDown."""
 
-    band_K: float = Field(default=0.5, gt=0, le=20)
-    time_constant_s: float = Field(default=1200.0, gt=0, le=86400)
-    max_s: Wait_s = 7200.0
+    band_K: float = Field(default=0.5, gt=0, le=20, description="How near to the air the camera has to be.")
+    time_constant_s: float = Field(
+        default=1200.0, gt=0, le=86400, description="With which the camera's slowest part cools down."
+    )
+    max_s: Wait_s = Field(default=7200.0, description="The longest wait.")
 
 
 @dataclass(frozen=True, slots=True)

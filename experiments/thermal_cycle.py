@@ -35,17 +35,23 @@ from thermostand.experiments.steps import SOAK_BAND_K, CloseFlap, Role, SetTempe
 class ThermalCycle(StillTable, Guaranteed):
     """Parameters of a thermal cycle; temperatures are chamber set-points."""
 
-    reference_degC: Chamber_degC = 24.0
-    equilibrium_s: Wait_s = 2700.0
-    set_points_degC: tuple[Chamber_degC, ...] = Field(min_length=1, max_length=1000)
-    held_out_degC: tuple[Chamber_degC, ...] = Field(default=(), max_length=1000)
+    reference_degC: Chamber_degC = Field(default=24.0, description="The set-point that drift is counted from.")
+    equilibrium_s: Wait_s = Field(
+        default=2700.0, description="The soak at the reference, with the camera on, before the first frames."
+    )
+    set_points_degC: tuple[Chamber_degC, ...] = Field(
+        min_length=1, max_length=1000, description="The chamber's set-points in the order of their visits."
+    )
+    held_out_degC: tuple[Chamber_degC, ...] = Field(
+        default=(), max_length=1000, description="Those of them that no fit sees, to judge it by."
+    )
     # The paper's 45 min (section 3.2). On drawn cameras (60 to 69) dwells of 29 min leave 0.85 times as much 90 min
     # after a change in the median and 1.8 times in the worst case, but 1.5 and 2.3 times 4 h after it.
-    soak_s: Wait_s = 2700.0
+    soak_s: Wait_s = Field(default=2700.0, description="The soak at each set-point.")
     until: UntilSettledOrKnown = None
-    cycles: int = Field(default=1, ge=1, le=100)
-    reference_frames: FrameCount = 20
-    frames_per_point: FrameCount = 1
+    cycles: int = Field(default=1, ge=1, le=100, description="How often the set-points are gone through.")
+    reference_frames: FrameCount = Field(default=20, description="Frames at the reference, at the beginning.")
+    frames_per_point: FrameCount = Field(default=1, description="Frames at each set-point.")
 
     @model_validator(mode="after")
     def _check_possible(self) -> Self:

@@ -33,13 +33,19 @@ class Validation(MovingTable, Guaranteed):
     positions: V0, V1, ... in order of visit. check_home_every: temperatures between two home checks.
     """
 
-    temperatures_degC: tuple[Chamber_degC, ...] = Field(min_length=2, max_length=100)
-    positions: tuple[TablePosition, ...] = Field(min_length=2, max_length=100)
-    equilibrium_s: Wait_s = 2700.0
-    soak_s: Wait_s = 2700.0
+    temperatures_degC: tuple[Chamber_degC, ...] = Field(
+        min_length=2, max_length=100, description="The chamber's set-points; the first one is the reference."
+    )
+    positions: tuple[TablePosition, ...] = Field(
+        min_length=2, max_length=100, description="V0, V1, ... in the order of their visits at each temperature."
+    )
+    equilibrium_s: Wait_s = Field(
+        default=2700.0, description="The soak at the reference, with the camera on, before the first frames."
+    )
+    soak_s: Wait_s = Field(default=2700.0, description="The soak at each temperature.")
     until: Until = None
-    reference_frames: FrameCount = 20
-    check_home_every: int = Field(default=3, ge=1, le=100)
+    reference_frames: FrameCount = Field(default=20, description="Frames at each position at the reference.")
+    check_home_every: int = Field(default=3, ge=1, le=100, description="Temperatures between two home checks.")
 
     @model_validator(mode="after")
     def _check_possible(self) -> Self:

@@ -41,13 +41,22 @@ class WarmUp(StillTable):
     the stand's configuration; empty for the camera that is mounted, with no question asked.
     """
 
-    chamber_degC: Chamber_degC = 24.0
-    band_K: float = Field(default=0.5, gt=0, le=20)
-    time_constant_s: float = Field(default=1200.0, gt=0, le=86400)
-    cool_down_max_s: Wait_s = 7200.0
-    frames: FrameCount = 3600
-    rolls_deg: tuple[Roll_deg, ...] = Field(default=(0.0,), min_length=1, max_length=36)
-    cameras: tuple[CameraName, ...] = Field(default=(), max_length=20)
+    chamber_degC: Chamber_degC = Field(default=24.0, description="The chamber's set-point throughout.")
+    band_K: float = Field(default=0.5, gt=0, le=20, description="The camera is cold when it is this near to the air.")
+    time_constant_s: float = Field(
+        default=1200.0, gt=0, le=86400, description="With which the camera's slowest part cools down."
+    )
+    cool_down_max_s: Wait_s = Field(default=7200.0, description="The longest wait for a cold camera.")
+    frames: FrameCount = Field(default=3600, description="Frames from the camera's switching on.")
+    rolls_deg: tuple[Roll_deg, ...] = Field(
+        default=(0.0,),
+        min_length=1,
+        max_length=36,
+        description="Rolls about the optical axis, one warm-up each; somebody has to turn the camera.",
+    )
+    cameras: tuple[CameraName, ...] = Field(
+        default=(), max_length=20, description="What the operator mounts one after another; empty for the one mounted."
+    )
 
     @model_validator(mode="after")
     def _check_unique(self) -> Self:

@@ -540,6 +540,9 @@ IDLE_LOG_NOT_ENDED = event("idle_log_not_ended", "warning", "{text}", _SEE_DISK)
 IDLE_LOGS_REMOVED = event("idle_logs_removed", "info",
     "records between runs older than {days} days were removed: {names}")
 REPORTED = event("reported", "info", "the report of {session} is made; the page has it under Sessions")
+REHEARSED = event("rehearsed", "info", "the rehearsal of {recipe} is done: {session}, marked as simulated")
+NOT_REHEARSED = event("not_rehearsed", "warning", "the rehearsal of {recipe} ended: {text}",
+    "`stand run RECIPE --config FILE --virtual-time` shows it in a terminal")
 REPORT = event("report", "warning", "{session}: {text}",
     "the session's report shows where: *Sessions* on the page, or its report.html")
 NOT_REPORTED = event("not_reported", "warning", "{text}", "`stand session list` shows what the session lacks")

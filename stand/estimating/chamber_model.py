@@ -56,6 +56,9 @@ class Response(Document):
 class ChamberModel(Document):
     """The whole: both directions, the camera, and how many ramps each was learned from (0: a default).
 
+    camera_above_air_K: how much warmer than the air a camera is that is on, at the end of a ramp's dwell; 0 until
+    recorded runs have shown it.
+
     The defaults are 2 kW and a freezer's 600 W on about 60 kJ/K of liner, racks and air, and a camera for which the
     paper's dwell of 45 min (section 3.2) is three time constants.
     """
@@ -63,6 +66,7 @@ class ChamberModel(Document):
     heating: Response = Response(dead_s=30.0, rate_K_per_s=2.0 / 60.0, time_constant_s=120.0)
     cooling: Response = Response(dead_s=60.0, rate_K_per_s=0.6 / 60.0, time_constant_s=120.0)
     camera_time_constant_s: float = Field(default=900.0, gt=0)
+    camera_above_air_K: float = Field(default=0.0, ge=-50, le=100)
     heating_ramps: int = Field(default=0, ge=0)
     cooling_ramps: int = Field(default=0, ge=0)
     camera_ramps: int = Field(default=0, ge=0)
@@ -83,13 +87,15 @@ class Ramp:
     """One recorded answer to a new set-point.
 
     arrivals: (level in K, s after the step from when on the air stayed within it). camera_time_constant_s: of the
-    camera meanwhile, NaN when it did not move enough to fit it.
+    camera meanwhile, NaN when it did not move enough to fit it. camera_above_air_K: at its end, NaN without a camera's
+    temperature.
     """
 
     from_degC: float
     to_degC: float
     arrivals: tuple[tuple[float, float], ...]
     camera_time_constant_s: float
+    camera_above_air_K: float = math.nan
 
 
 def fit_chamber_model(ramps: Sequence[Ramp]) -> ChamberModel:
@@ -98,11 +104,13 @@ def fit_chamber_model(ramps: Sequence[Ramp]) -> ChamberModel:
     heating = [ramp for ramp in ramps if ramp.to_degC > ramp.from_degC]
     cooling = [ramp for ramp in ramps if ramp.to_degC < ramp.from_degC]
     seen_s = [ramp.camera_time_constant_s for ramp in ramps if not math.isnan(ramp.camera_time_constant_s)]
+    above_K = [ramp.camera_above_air_K for ramp in ramps if not math.isnan(ramp.camera_above_air_K)]
     default = ChamberModel()
     return ChamberModel(
         heating=_fit_response(heating, default.heating),
         cooling=_fit_response(cooling, default.cooling),
         camera_time_constant_s=float(np.median(seen_s)) if seen_s else default.camera_time_constant_s,
+        camera_above_air_K=float(np.median(above_K)) if above_K else default.camera_above_air_K,
         heating_ramps=len(heating),
         cooling_ramps=len(cooling),
         camera_ramps=len(seen_s),
@@ -182,7 +190,14 @@ def _extract_ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC:
     if math.isnan(stays_s[BAND_K]):
         return None
     time_constant_s = _estimate_time_constant_s(camera, stays_s[BAND_K], float(pv[0, -1]))
-    return Ramp(from_degC, to_degC, tuple(stays_s.items()), time_constant_s)
+    return Ramp(from_degC, to_degC, tuple(stays_s.items()), time_constant_s, _measure_above_air_K(camera, pv))
+
+
+def _measure_above_air_K(camera: NDArray[np.float64], pv: NDArray[np.float64]) -> float:
+    """How much warmer than the air the camera is in the last minute; NaN when its temperature is not there then."""
+    end_s = float(pv[0, -1])
+    last = [values[1, values[0] >= end_s - _CAMERA_MEAN_S] for values in (camera, pv)]
+    return float(last[0].mean() - last[1].mean()) if all(values.size for values in last) else math.nan
 
 
 def _find_arrival_s(pv: NDArray[np.float64], to_degC: float, level_K: float) -> float:

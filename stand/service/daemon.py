@@ -78,6 +78,7 @@ from thermostand.stand.service.queue_worker import (
     is_complete,
     load_queued_interruption,
 )
+from thermostand.stand.service.rehearsals import Rehearsals
 from thermostand.stand.service.run import run_on_stand
 from thermostand.stand.service.run_queue import RunQueue, make_note
 from thermostand.stand.service.stand_service import StandService
@@ -591,7 +592,9 @@ async def serve(
             keep = CountersFile(out, open_stand.disk.line(FILES_LINE).run, hub, clock)
             reports = ReportQueue(hub, clock)
             stack.push_async_callback(reports.close)
-            orders = RunQueue(open_stand, open_stand.disk, out, config_name, texts)
+            rehearsals = Rehearsals(hub, clock, config_name, out)
+            stack.push_async_callback(rehearsals.close)
+            orders = RunQueue(open_stand, open_stand.disk, out, config_name, texts, rehearsals.add)
             for segment in await orders.repair.call(salvage_unfinished, out):
                 hub.publish(SALVAGED.at(clock.now_ns(), format_salvaged(segment)))
             if accepted := config.list_accepted():

@@ -7,18 +7,19 @@ touches the disk is done in a thread of its own, which keeps no daemon from leav
 from __future__ import annotations
 
 import hashlib
-import importlib.resources
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from thermostand.experiments.steps import Capture
-from thermostand.foundation.errors import ConfigError, SessionError, StandError
+from thermostand.foundation.clock import to_ns
+from thermostand.foundation.errors import ConfigError, NotFound, SessionError, StandError
 from thermostand.foundation.readings import Quality
 from thermostand.foundation.workers import WorkerThread
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.disk import NOTES_LINE, QUEUE_LINE, REPAIR_LINE, DiskCalls, DiskProcess
 from thermostand.stand.config.check_record import ATTACHMENT
+from thermostand.stand.config.own_recipes import read_recipe, remove_recipe, save_recipe
 from thermostand.stand.estimating.run_estimate import PlanEstimate, estimate_plan, explain_small_disk
 from thermostand.stand.running.opening.open_stand import OpenStand
 from thermostand.stand.running.opening.stop import Stop
@@ -29,8 +30,9 @@ from thermostand.stand.service import queue
 from thermostand.stand.service.queue import RunOrigin
 from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, start_working
 from thermostand.stand.service.queue_worker import is_complete
+from thermostand.stand.service.run_preview import Turn, preview_order
 from thermostand.stand.serving.alerts import missing_command
-from thermostand.stand.serving.api_models import Conflict, Missing, QueuedRun, RunRequest, Who
+from thermostand.stand.serving.api_models import Conflict, Missing, QueuedRun, RunPreview, RunRequest, Who
 
 _SHOWN = 50  # runs that have ended
 
@@ -38,6 +40,8 @@ _SHOWN = 50  # runs that have ended
 class RunQueue:
     """The queue of the daemon that has `open_stand`. texts: config.yaml, target.yaml, optics of simulated cameras and
     the record of `stand check` where there is one, as they were when it began.
+
+    rehearse: is given a recipe's name and text, and runs it in virtual time.
 
     queued: as it was last read. stop: of the run under way. leaving: the daemon ends, and its run is interrupted by it.
     """
@@ -49,6 +53,7 @@ class RunQueue:
         directory: Path,
         config_name: str,
         texts: dict[str, str],
+        rehearse: Callable[[str, str], None] | None = None,
     ) -> None:
         self.queued = Queue()
         self.stop: Stop | None = None
@@ -62,6 +67,7 @@ class RunQueue:
         self._open_stand = open_stand
         self._config_name = config_name
         self._texts = texts
+        self._rehearse = rehearse
         self._expected_s: dict[int, float] = {}
 
     async def read(self) -> None:
@@ -101,6 +107,29 @@ class RunQueue:
         self._expected_s[entry.id] = estimate.duration_s
         await self.read()
         return entry
+
+    async def preview(self, request: RunRequest, run_end_ns: int | None) -> RunPreview:
+        """What the request would do if it were queued now; ConfigError for what is wrong with it. run_end_ns: when the
+        run under way is expected to end, None without one or when that is not known."""
+        order = await self.reading.call(self._load_order, request)
+        turn, lacks = self._find_turn(run_end_ns), self._list_lacks(order)
+        return await self.reading.call(preview_order, order, self.directory, turn, lacks)
+
+    def _find_turn(self, run_end_ns: int | None) -> Turn:
+        """When a run that is queued now has its turn."""
+        entries = self.queued.entries
+        is_running = any(entry.state is QueueState.RUNNING for entry in entries)
+        before = [entry for entry in entries if entry.is_open]
+        ahead = len(before) + is_running
+        if self.queued.halted:
+            return Turn("halted", ahead, None)
+        now_ns = self._open_stand.assembly.clock.now_ns()
+        expected_s = [self._expected_s.get(entry.id) for entry in before]
+        known_s = [each for each in expected_s if each is not None]
+        begin_ns = run_end_ns if is_running else now_ns
+        if begin_ns is None or len(known_s) < len(expected_s):
+            return Turn("queued", ahead, None)
+        return Turn("queued" if ahead else "now", ahead, begin_ns + to_ns(sum(known_s)))
 
     async def cancel(self, number: int) -> None:
         """Take it out; what it was halted for is over when it was that run."""
@@ -164,7 +193,7 @@ class RunQueue:
         """ConfigError when the recipe cannot be run on this stand."""
         if bool(request.recipe) == bool(request.recipe_text):
             raise ConfigError("either the name of an installed recipe, or the text of one")
-        text = request.recipe_text or _read_installed(request.recipe)
+        text = request.recipe_text or self._read_named(request.recipe)
         names = {
             "config.yaml": self._config_name,
             "recipe.yaml": request.recipe or "the recipe",
@@ -172,6 +201,31 @@ class RunQueue:
         }
         order = replace(parse_order({**self._texts, "recipe.yaml": text}, names), attended=request.attended)
         return self._adapt_to_stand(order)
+
+    def _read_named(self, name: str) -> str:
+        try:
+            return read_recipe(self.directory, name)
+        except NotFound as error:
+            raise Missing(str(error)) from error
+
+    async def save_recipe(self, name: str, text: str) -> None:
+        """Keep a recipe of one's own; ConfigError for what is wrong with it."""
+        await self.disk.call(save_recipe, str(self.directory), name, text)
+
+    async def remove_recipe(self, name: str) -> None:
+        """Remove a recipe of one's own; Missing when there is none."""
+        try:
+            await self.disk.call(remove_recipe, str(self.directory), name)
+        except NotFound as error:
+            raise Missing(str(error)) from error
+
+    async def rehearse_order(self, request: RunRequest) -> str:
+        """Begin a rehearsal in virtual time; the recipe's name. ConfigError for what is wrong with it."""
+        order = await self.reading.call(self._load_order, request)
+        if self._rehearse is None:
+            raise Conflict("this program makes no rehearsals")
+        self._rehearse(order.recipe.name, order.recipe_text)
+        return order.recipe.name
 
     def get_order(self, entry: QueueEntry) -> Order:
         """What it asks for, on the stand as it is open now; ConfigError as `queue.order_of`."""
@@ -213,6 +267,10 @@ class RunQueue:
         return estimate
 
     def _check_wires(self, order: Order) -> None:
+        if lacks := self._list_lacks(order):
+            raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")
+
+    def _list_lacks(self, order: Order) -> list[str]:
         """What does not answer now, and what else would end the run at its beginning."""
         assembly = self._open_stand.assembly
         lacks = [
@@ -226,19 +284,9 @@ class RunQueue:
             lacks.append("a camera does not answer")
         if missing := missing_command(assembly.config.alerts):
             lacks.append(missing)
-        if lacks:
-            raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")
+        return lacks
 
 
 def make_note(who: Who, note: str, tags: Sequence[str]) -> OperatorNote | None:
     """A note and tags, None without either; ConfigError for what is no tag."""
     return OperatorNote(who, note, tags) if note.strip() or tags else None
-
-
-def _read_installed(name: str) -> str:
-    """The text of an installed recipe; Missing lists what there is."""
-    root = Path(str(importlib.resources.files("thermostand.configs"))) / "recipes"
-    known = {path.stem: path for path in root.glob("*.yaml")}
-    if name not in known:
-        raise Missing(f"no recipe of that name is installed; there are {', '.join(sorted(known))}")
-    return known[name].read_text(encoding="utf-8")

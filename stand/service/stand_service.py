@@ -7,7 +7,7 @@ the page is the page's.
 from __future__ import annotations
 
 from collections.abc import Collection, Coroutine, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 from pydantic import ConfigDict, Field, JsonValue
 
@@ -27,7 +27,9 @@ from thermostand.stand.serving.api_models import (
     PlanRequest,
     PlanStep,
     QueuedRun,
+    RunPreview,
     RunRequest,
+    RunStatus,
     SimulatedFaults,
     StandState,
     Tag,
@@ -96,6 +98,19 @@ class SubmitRequest(RunRequest):
     key: Annotated[str, Typed("key", "A name of your own for this order: the same name again queues nothing.")] = Field(
         default="", max_length=200
     )
+
+
+class RecipeRequest(Document):
+    """A recipe of one's own, by its name."""
+
+    recipe: SessionName
+
+
+class SaveRequest(Document):
+    """A recipe under its own name. recipe_text: YAML or JSON, as GET /api/v1/recipes/schema has it."""
+
+    recipe: SessionName
+    recipe_text: str = Field(min_length=1, max_length=LONGEST_RECIPE)
 
 
 class CancelRequest(Document):
@@ -172,6 +187,12 @@ class StandService(Served):
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
         """What an edit would say; nothing is ordered, so nothing is recorded."""
         return self._require_run().check_edit(from_index, steps)
+
+    async def preview(self, request: RunRequest) -> RunPreview:
+        """What a recipe would do here now: see RunPreview."""
+        run = self._run
+        run_end_ns = None if run is None else cast("RunStatus", run.get_state_fields()["run"]).end_ns
+        return await self._require_queue().preview(request, run_end_ns)
 
     def devices(self) -> tuple[DeviceState, ...]:
         """The commands that devices take by hand, between runs."""
@@ -276,6 +297,25 @@ class StandService(Served):
         entry = await orders.submit(who, order, given.key)
         self.host.wake()
         return orders.describe_run(entry)
+
+    @command("/recipes/{recipe}", http="PUT", verbs=(), by_secop=None, title="Save as a recipe")
+    async def save_recipe(self, who: Who, given: SaveRequest) -> str:
+        """Save a recipe of your own beside the sessions, in the place of one of that name; installed ones stay."""
+        await self._require_queue().save_recipe(given.recipe, given.recipe_text)
+        return f"saved as {given.recipe}"
+
+    @command("/recipes/{recipe}", http="DELETE", verbs=(), by_secop=None, title="Remove this recipe")
+    async def remove_recipe(self, who: Who, given: RecipeRequest) -> str:
+        """Remove a recipe of your own; runs that were queued with it stay as they are."""
+        await self._require_queue().remove_recipe(given.recipe)
+        return f"the recipe {given.recipe} is removed"
+
+    @command("/recipes/rehearse", verbs=(), by_secop=None)
+    async def rehearse(self, who: Who, given: RunRequest) -> str:
+        """Run a recipe in virtual time, in a simulated laboratory. Nothing of this stand moves; the session is in the
+        list, marked as simulated, when it is done."""
+        name = await self._require_queue().rehearse_order(given)
+        return f"{name} is rehearsed in virtual time; its session comes into the list, marked as simulated"
 
     @command("/queue/{run}", http="DELETE", verbs=("queue remove",), title="Remove")
     async def cancel(self, who: Who, given: CancelRequest) -> str:

@@ -18,6 +18,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.readings import Cause, Quality, Reading
 from thermostand.recording.reading.notes import LONGEST_NOTE, TAG
+from thermostand.stand.estimating.course import Course
 
 if TYPE_CHECKING:
     from thermostand.foundation.hub import Hub
@@ -295,6 +296,48 @@ class RunRequest(Document):
     attended: bool = Field(default=False, strict=True)
     tags: tuple[Tag, ...] = Field(default=(), max_length=32)
     note: str = Field(default="", max_length=LONGEST_NOTE)
+
+
+class PlanWarning(Value):
+    """What will not be as it is meant in a plan. step: index in the plan; at_s: when it begins, from the plan's
+    beginning."""
+
+    step: int
+    at_s: float
+    text: str
+
+
+class RunPreview(Value):
+    """What a recipe would do on this stand now; nothing is queued.
+
+    recipe: as a document, to fill a form with; recipe_text: the same as YAML. duration_s: of the plan; after_s: of the
+    way back to the laboratory's temperature behind it. begins: "now" when it would begin at once, "queued" behind
+    `ahead` others (begin_ns: when that is expected, None when unknown), "halted" when the queue waits for somebody.
+    size_bytes: what it records; free_bytes: on the disk. lacks: why it would be refused as the stand is now. looks:
+    what steps of the image the plan can show, in words, "" without looks at drift. learned: where the durations come
+    from, in words. chamber_degC: the stand's limits; dew_degC: below it nothing may be while the flap is open, None
+    when that is not known.
+    """
+
+    recipe: dict[str, JsonValue]
+    recipe_text: str
+    steps: int
+    duration_s: float
+    after_s: float
+    begins: Literal["now", "queued", "halted"]
+    ahead: int
+    begin_ns: int | None
+    end_ns: int | None
+    frames: int
+    size_bytes: int
+    free_bytes: int
+    lacks: tuple[str, ...]
+    warnings: tuple[PlanWarning, ...]
+    looks: str
+    learned: str
+    chamber_degC: tuple[float, float]
+    dew_degC: float | None
+    course: Course
 
 
 class Argument(Value):

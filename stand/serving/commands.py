@@ -31,6 +31,8 @@ from thermostand.stand.serving.api_models import (
     Done,
     PlanCheck,
     PlanStep,
+    RunPreview,
+    RunRequest,
     SimulatedFaults,
     StandState,
     Who,
@@ -175,6 +177,10 @@ class Served(ABC):
     @abstractmethod
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
         """What the command `edit` would say; changes nothing. Any thread may call it. Conflict when nothing is run."""
+
+    @abstractmethod
+    async def preview(self, request: RunRequest) -> RunPreview:
+        """What a recipe would do on this stand now; queues nothing. Conflict where no queue is kept."""
 
     @abstractmethod
     def devices(self) -> tuple[DeviceState, ...]:

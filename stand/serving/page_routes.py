@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import yaml
 from fastapi import APIRouter, Query, Response
-from fastapi import Path as PathOf
 from pydantic import BaseModel
 
 from thermostand.foundation.errors import ConfigError
 from thermostand.recording.format.layout import TELEMETRY
-from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
 from thermostand.stand.serving.api.session_routes import DiskReader, SessionName, find_session
 from thermostand.stand.serving.api.stream import make_json
@@ -38,7 +34,6 @@ _TYPES = {
     ".webmanifest": "application/manifest+json",
     ".txt": "text/plain; charset=utf-8",
 }
-_RECIPE = re.compile(r"[a-z0-9][a-z0-9-]*")
 _LIMIT_S = 60.0  # to read a recorded session, at the lowest priority
 _MOST_CHANNELS_TEXT = 4000
 _DRIFT_LIMIT_S = 300.0  # round number; nothing was measured
@@ -119,7 +114,6 @@ class PageRoutes:
         router = APIRouter()
         self._add_curves(router)
         self._add_frame(router)
-        _add_recipe(router)
         _add_files(router)
         return router
 
@@ -217,16 +211,6 @@ def _get_preview(viewing: PageData, camera: str) -> Preview | None:
     if camera and camera not in viewing.previews and viewing.previews:
         raise Missing("no frame of a camera of that name was looked at")
     return viewing.previews.get(camera) if camera else next(iter(viewing.previews.values()), None)
-
-
-def _add_recipe(router: APIRouter) -> None:
-    @router.get("/api/v1/recipes/{name}")
-    async def recipe(name: Annotated[str, PathOf(max_length=100)]) -> dict[str, Any]:
-        """An installed recipe as a document, to fill a form with."""
-        path = find_packaged("recipes", "overnight").parent / f"{name}.yaml"
-        if not _RECIPE.fullmatch(name) or not path.is_file():
-            raise Missing("there is no installed recipe of that name")
-        return yaml.safe_load(path.read_text("utf-8"))
 
 
 def _add_files(router: APIRouter) -> None:

@@ -343,6 +343,7 @@ async def serve_cycle(
     """The session, served at that port while inside."""
     desk = CycleService()
     desk.clock = desk.clock if isinstance(desk.clock, WallClock) else WallClock()
+    desk.sessions = folder
     prepare(desk)
     viewing = PageData(desk.hub, desk.clock, folder, TARGET)
     desk.live_through(viewing)

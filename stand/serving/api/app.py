@@ -30,6 +30,8 @@ from thermostand.stand.serving.api_models import (
     PlanCheck,
     PlanRequest,
     QueuedRun,
+    RunPreview,
+    RunRequest,
     SimulatedFaults,
     Who,
 )
@@ -88,6 +90,11 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
     async def check_edit(body: PlanRequest) -> Response:
         """What replacing these steps would say, step by step; changes nothing."""
         return _make_response(await bridge.check_edit(body.from_index, body.steps))
+
+    @router.post("/recipes/preview", response_model=RunPreview)
+    async def preview(body: RunRequest) -> Response:
+        """What a recipe would do on this stand now: its course over time, frames, bytes, end; queues nothing."""
+        return _make_response(await bridge.ask(lambda service: service.preview(body)))
 
     @router.get("/queue", response_model=list[QueuedRun])
     async def queue() -> Response:

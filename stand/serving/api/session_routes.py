@@ -7,17 +7,18 @@ import concurrent.futures
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 from fastapi import APIRouter, Response
 from fastapi import Path as FromPath
 from pydantic import BaseModel
 
-from thermostand.foundation.errors import SessionError
+from thermostand.foundation.documents import parse_yaml
+from thermostand.foundation.errors import NotFound, SessionError
 from thermostand.recording.format.inventory import list_segments
 from thermostand.recording.reading.catalogue import ListedSession, SessionCache, load_catalogue, look_at
+from thermostand.stand.config.own_recipes import NamedRecipe, list_recipes, read_recipe
 from thermostand.stand.config.recipe import Recipe
-from thermostand.stand.config.stand_config import find_packaged
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
 from thermostand.stand.serving.api_models import Missing
 
@@ -28,13 +29,6 @@ _DISK_LIMIT_S = 20.0  # a disk that slept needs some seconds; round number, noth
 
 SessionName = Annotated[str, FromPath(max_length=255)]
 Result = TypeVar("Result")
-
-
-class RecipeEntry(BaseModel):
-    """An installed recipe and its text."""
-
-    name: str
-    text: str
 
 
 class SessionEntry(BaseModel):
@@ -102,15 +96,24 @@ def make_session_routes(_: Bridge, folder: Path) -> APIRouter:
     """The routes."""
     router, disk, memory = APIRouter(prefix="/api/v1"), DiskReader(), SessionCache()
 
-    @router.get("/recipes", response_model=list[RecipeEntry])
-    async def recipes() -> list[RecipeEntry]:
-        """The installed recipes."""
-        return await disk.ask(_list_recipes)
+    @router.get("/recipes", response_model=list[NamedRecipe])
+    async def recipes() -> list[NamedRecipe]:
+        """The installed recipes, then those that were saved here."""
+        return await disk.ask(lambda: list(list_recipes(folder)))
 
     @router.get("/recipes/schema")
     async def schema() -> dict[str, Any]:
         """The JSON Schema of a recipe."""
         return Recipe.model_json_schema()
+
+    @router.get("/recipes/{name}")
+    async def recipe(name: SessionName) -> dict[str, Any]:
+        """A recipe as a document, to fill a form with."""
+        try:
+            text = await disk.ask(lambda: read_recipe(folder, name))
+        except NotFound as error:
+            raise Missing(str(error)) from None
+        return cast("dict[str, Any]", parse_yaml(text, name))
 
     @router.get("/sessions", response_model=list[SessionEntry])
     async def sessions() -> list[SessionEntry]:
@@ -132,11 +135,6 @@ def make_session_routes(_: Bridge, folder: Path) -> APIRouter:
         return Response(text, headers=headers, media_type="text/html; charset=utf-8")
 
     return router
-
-
-def _list_recipes() -> list[RecipeEntry]:
-    here = find_packaged("recipes", "thermal-cycle").parent
-    return [RecipeEntry(name=path.stem, text=path.read_text("utf-8")) for path in sorted(here.glob("*.yaml"))]
 
 
 def _list_sessions(folder: Path, memory: SessionCache) -> list[SessionEntry]:

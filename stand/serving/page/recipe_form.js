@@ -7,6 +7,8 @@ export class RecipeForm {
     this.schema = schema;
     this.axes = axes;
     this.element = h("div", { class: "stack" });
+    // What is wrong in a folded part is shown.
+    this.element.addEventListener("invalid", ({ target }) => { for (let part = target.closest("details"); part; part = part.parentElement.closest("details")) part.open = true; }, true);
   }
 
   resolve(schema) {
@@ -26,7 +28,7 @@ export class RecipeForm {
   load(recipe) {
     this.parts = [];
     this.steps = recipe.steps?.length ? this.rows_field("steps, one after another", this.schema.properties.steps, recipe.steps, true) : null;
-    this.name = text_field("name", recipe.name ?? "", { pattern: "[a-z0-9][a-z0-9\\-]*", maxlength: 100, required: true });
+    this.name = name_field(recipe.name ?? "");
     this.about = text_field("description", recipe.description ?? "", { maxlength: 1000 });
     this.places = h("div", { class: "stack" });
     this.more = h("select", { "aria-label": "Kind of experiment" }, this.kinds().map((kind) => h("option", { value: kind }, words(kind))));
@@ -44,7 +46,10 @@ export class RecipeForm {
     const fields = schema.properties ? this.fields(schema, values) : [schema.type === "array" ? this.rows_field(kind, schema, Array.isArray(values) ? values : [], true) : json_field("", values, "As JSON")];
     const box = h("fieldset", {}, h("legend", {}, words(kind)));
     const part = { kind, fields, is_whole: !schema.properties };
-    box.append(...fields.map((field) => field.row), h("button", { type: "button", class: "small", onclick: () => { this.parts.splice(this.parts.indexOf(part), 1); box.remove(); } }, `Remove this ${words(kind)}`));
+    // What is at its usual value is one click away: the rest is what this recipe is about.
+    const [asked, usual] = schema.properties ? split_usual(schema, values, fields) : [fields, []];
+    const more = usual.length ? h("details", {}, h("summary", {}, usual.length === 1 ? "1 more, at its usual value" : `${usual.length} more, at their usual values`), usual.map((field) => field.row)) : null;
+    box.append(...asked.map((field) => field.row), ...(more ? [more] : []), h("button", { type: "button", class: "small", onclick: () => { this.parts.splice(this.parts.indexOf(part), 1); box.remove(); } }, `Remove this ${words(kind)}`));
     this.parts.push(part);
     this.places.append(box);
   }
@@ -62,11 +67,11 @@ export class RecipeForm {
 
   field_of(name, schema, value, required) {
     const given = value ?? schema.default;
-    if (schema.enum) return choice_field(name, schema.enum, given);
+    if (schema.enum) return choice_field(name, schema.enum, given, schema.description);
     if (schema.type === "number" || schema.type === "integer") return number_field(name, schema, given, required);
-    if (schema.type === "boolean") return flag_field(name, Boolean(given));
-    if (schema.type === "string") return text_field(name, given ?? "", { pattern: schema.pattern, maxlength: schema.maxLength, required });
-    if (schema.type === "array" && this.resolve(schema.items ?? {}).type === "number") return list_field(name, this.resolve(schema.items), given ?? [], required);
+    if (schema.type === "boolean") return flag_field(name, Boolean(given), schema.description);
+    if (schema.type === "string") return text_field(name, given ?? "", { pattern: schema.pattern, maxlength: schema.maxLength, required }, schema.description);
+    if (schema.type === "array" && this.resolve(schema.items ?? {}).type === "number") return list_field(name, this.resolve(schema.items), given ?? [], required, schema.description);
     if (schema.type === "object" && schema.additionalProperties?.type === "number") return this.position_field(name, given ?? {});
     if (schema.properties) return this.object_field(name, schema, given, required);
     if (schema.type === "array" && this.resolve(schema.items ?? {}).properties) return this.rows_field(name, schema, given ?? [], required);
@@ -128,6 +133,12 @@ export class RecipeForm {
   }
 }
 
+// The fields that the recipe gives, or has to, and those that are as usual.
+function split_usual(schema, values, fields) {
+  const is_asked = ({ name }) => name in values || schema.required?.includes(name);
+  return [fields.filter(is_asked), fields.filter((each) => !is_asked(each))];
+}
+
 // What holds other fields has its name above them, so that parts within parts do not become narrower and narrower.
 function nested(made) {
   made.row.classList.add("nested");
@@ -162,35 +173,57 @@ function field(name, input, help, value) {
   return { name, value, row: h("div", { class: "field" }, label, input, help ? h("small", { id: `${id}-help` }, help) : null) };
 }
 
+// Waits are typed in minutes where people think in minutes.
+const in_minutes = (name, schema, given) => name.endsWith("_s") && !name.startsWith("interval") && (schema.maximum ?? Infinity) >= 3600 && (schema.default ?? given ?? 3600) >= 60;
+
 function number_field(name, schema, given, required) {
-  const least = schema.minimum ?? schema.exclusiveMinimum, most = schema.maximum ?? schema.exclusiveMaximum;
-  const input = h("input", { type: "number", step: schema.type === "integer" ? 1 : "any", min: least, max: most, required, value: given ?? "" });
+  const scale = in_minutes(name, schema, given) ? 60 : 1;
+  const shown = (value) => (value === undefined || value === null ? undefined : Math.round((value / scale) * 1e6) / 1e6);
+  const least = shown(schema.minimum ?? schema.exclusiveMinimum), most = shown(schema.maximum ?? schema.exclusiveMaximum);
+  const input = h("input", { type: "number", step: schema.type === "integer" ? 1 : "any", min: least, max: most, required, value: shown(given) ?? "" });
+  const before = input.value;
   const bounds = least !== undefined && most !== undefined ? `${least} to ${most}` : least !== undefined ? `${least} or more` : most !== undefined ? `${most} or less` : "";
-  const help = [bounds, schema.default !== undefined && schema.default !== null ? `usually ${schema.default}` : ""].filter(Boolean).join("; ");
-  return field(name, input, help, () => (input.value === "" || Number(input.value) === schema.default ? undefined : Number(input.value)));
+  const usual = schema.default !== undefined && schema.default !== null ? `usually ${shown(schema.default)}` : "";
+  const help = help_of(schema.description, [bounds, usual].filter(Boolean).join("; "));
+  const typed = () => (input.value === before && given !== null ? given : scale === 1 ? Number(input.value) : Math.round(Number(input.value) * scale * 1e6) / 1e6);
+  const made = field(name, input, help, () => (input.value === "" || typed() === schema.default ? undefined : typed()));
+  if (scale === 60) made.row.querySelector("label").textContent = words(name).replace(/, s$/, ", min");
+  return made;
 }
 
-function text_field(name, given, attributes) {
+const help_of = (description, more) => [description, more].filter(Boolean).join(" ");
+
+function text_field(name, given, attributes, help = "") {
   const input = h("input", { type: "text", value: given, ...attributes });
-  return field(name, input, "", () => input.value || undefined);
+  return field(name, input, help, () => input.value || undefined);
 }
 
-function flag_field(name, given) {
+// A name is made valid where it can be, and refused only when nothing of it is left.
+function name_field(given) {
+  const made = text_field("name", given, { maxlength: 100, required: true }, "Letters, digits and hyphens.");
+  const input = made.row.querySelector("input");
+  input.addEventListener("change", () => { input.value = valid_name(input.value); });
+  return { ...made, value: () => valid_name(input.value) || undefined };
+}
+
+export const valid_name = (text) => text.normalize("NFKD").replace(/\p{M}/gu, "").toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 100);
+
+function flag_field(name, given, help = "") {
   const input = h("input", { type: "checkbox" });
   input.checked = given;
-  return field(name, input, "", () => input.checked);
+  return field(name, input, help, () => input.checked);
 }
 
-function choice_field(name, choices, given) {
+function choice_field(name, choices, given, help = "") {
   const input = h("select", {}, choices.map((each) => h("option", { value: each }, words(each))));
   input.value = given;
-  return field(name, input, "", () => input.value);
+  return field(name, input, help, () => input.value);
 }
 
-function list_field(name, items, given, required) {
+function list_field(name, items, given, required, description) {
   const input = h("input", { type: "text", value: given.join(", "), required, inputmode: "text", size: 40 });
   const bounds = items.minimum !== undefined ? `, each ${items.minimum} to ${items.maximum}` : "";
-  return field(name, input, `numbers with commas between them${bounds}`, () => {
+  return field(name, input, help_of(description, `numbers with commas between them${bounds}`), () => {
     const texts = input.value.split(/[\s,;]+/).filter(Boolean), numbers = texts.map(Number);
     const wrong = texts.find((_, index) => Number.isNaN(numbers[index]));
     if (wrong !== undefined) throw new Error(`${words(name)}: ${wrong} is not a number`);

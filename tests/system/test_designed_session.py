@@ -1,0 +1,45 @@
+"""A session that is designed at a daemon: previewed, saved as a recipe of one's own, rehearsed; over its interface."""
+
+import json
+
+import pytest
+
+from tests.system.test_daemon import BRIEF, is_idle, serve
+from thermostand.foundation.errors import SessionError
+from thermostand.recording.reading.catalogue import look_at
+
+__all__ = ["serve"]
+
+
+def test_a_design_is_previewed_saved_rehearsed_and_removed(serve):
+    served = serve()
+    served.until(is_idle)
+    seen = served.post("recipes/preview", recipe_text=BRIEF)
+    assert (seen["begins"], seen["ahead"], seen["steps"], seen["lacks"]) == ("now", 0, 3, [])
+    assert seen["recipe"]["steps"] == [{"start_chamber": 26}, {"soak": 0.5}, "stop_chamber"]
+    assert served.state().queue == ()  # nothing was queued
+
+    put = served.server.request("PUT", "/api/v1/recipes/brief", {"recipe_text": BRIEF}, 20.0)
+    assert put["verb"] == "save_recipe"
+    for name, text in (("other", BRIEF), ("demo", BRIEF.replace("brief", "demo")), ("brief", "steps: 3")):
+        with pytest.raises(SessionError):  # another name, an installed one's, no recipe
+            served.server.request("PUT", f"/api/v1/recipes/{name}", {"recipe_text": text}, 20.0)
+    known = served.server.request("GET", "/api/v1/recipes", None, 20.0)
+    assert [each["name"] for each in known if each["own"]] == ["brief"]
+    assert served.server.request("GET", "/api/v1/recipes/brief", None, 20.0)["name"] == "brief"
+
+    served.post("recipes/rehearse", recipe="brief")
+    served.until(lambda _: _find_event(served, "rehearsed") is not None)
+    session = _find_event(served, "rehearsed")["data"]["session"]
+    assert look_at(served.out / session).simulated
+    assert served.state().queue == ()  # a rehearsal is no run of the stand
+
+    served.server.request("DELETE", "/api/v1/recipes/brief", None, 20.0)
+    with pytest.raises(SessionError):
+        served.post("recipes/preview", recipe="brief")
+
+
+def _find_event(served, kind):
+    events = served.server.request("GET", "/api/v1/events?limit=200", None, 20.0)["events"]
+    assert not [each for each in events if each.get("kind") == "not_rehearsed"], json.dumps(events[-3:])
+    return next((each for each in events if each.get("kind") == kind), None)
