@@ -25,10 +25,10 @@ async def choose(page, recipe):
     return await (await answer.value).json()
 
 
-async def test_what_a_session_will_do_follows_what_is_typed(night):
-    night.queue = []
-    async with a_page(night.chromium, night.port, "queue", DESKTOP) as page:
-        before = await choose(page, "thermal-cycle")
+async def test_what_a_session_will_do_follows_what_is_typed(desk):
+    desk.queue = []
+    async with a_page(desk.chromium, desk.port, "queue", DESKTOP) as page:
+        before = await choose(page, "thermal-desk")
         await page.get_by_text("it begins at once").wait_for()
         assert await page.locator("div.course circle.capture").count() == len(before["course"]["captures"]) == 49
         await page.get_by_text("Look at and change its parameters").click()
@@ -48,9 +48,9 @@ async def test_what_a_session_will_do_follows_what_is_typed(night):
         assert await page.get_by_role("button", name="Add to the queue").is_disabled()
 
 
-async def test_a_level_is_moved_with_keys_and_by_dragging(night):
-    async with a_page(night.chromium, night.port, "queue", DESKTOP) as page:
-        await choose(page, "thermal-cycle")
+async def test_a_level_is_moved_with_keys_and_by_dragging(desk):
+    async with a_page(desk.chromium, desk.port, "queue", DESKTOP) as page:
+        await choose(page, "thermal-desk")
         level = page.get_by_role("slider", name="set-point 48 °C")
         async with page.expect_response("**/recipes/preview") as answer:
             await level.press("ArrowUp")
@@ -71,8 +71,8 @@ async def test_a_level_is_moved_with_keys_and_by_dragging(night):
         assert highest > 48.5
 
 
-async def test_a_recipe_is_written_as_yaml_saved_rehearsed_and_removed(night):
-    async with a_page(night.chromium, night.port, "queue", DESKTOP) as page:
+async def test_a_recipe_is_written_as_yaml_saved_rehearsed_and_removed(desk):
+    async with a_page(desk.chromium, desk.port, "queue", DESKTOP) as page:
         await choose(page, "demo")
         from playwright.async_api import expect
 
@@ -92,22 +92,20 @@ async def test_a_recipe_is_written_as_yaml_saved_rehearsed_and_removed(night):
         assert await name.input_value() == "mein-nachtlauf-o2"  # made valid, not refused
         await page.get_by_role("button", name="Save as a recipe").click()
         await page.get_by_text("saved as mein-nachtlauf-o2").wait_for()
-        saved = night.sessions / "recipes" / "mein-nachtlauf-o2.yaml"
+        saved = desk.sessions / "recipes" / "mein-nachtlauf-o2.yaml"
         assert parse_document(saved.read_text(), Recipe, "saved").name == "mein-nachtlauf-o2"
         await page.get_by_role("button", name="Rehearse").click()
-        await until(lambda: night.rehearsed.get("name") == "mein-nachtlauf-o2")
+        await until(lambda: desk.rehearsed.get("name") == "mein-nachtlauf-o2")
         await page.get_by_role("button", name="Remove this recipe").click()
         await until(lambda: not saved.exists())
 
 
-async def test_a_run_that_ended_early_is_resumed_on_the_plan_with_what_is_done_again(night):
-    night.is_idle = True
-    night.queue[0] = night.queue[0].model_copy(
-        update={"state": "interrupted", "session": "20261122T180000Z-validation"}
-    )
-    async with a_page(night.chromium, night.port, "plan", DESKTOP) as page:
-        night.plan = lambda: ()
-        night.resume = lambda who, given: given.session
+async def test_a_run_that_ended_early_is_resumed_on_the_plan_with_what_is_done_again(desk):
+    desk.is_idle = True
+    desk.queue[0] = desk.queue[0].model_copy(update={"state": "interrupted", "session": "20261122T180000Z-validation"})
+    async with a_page(desk.chromium, desk.port, "plan", DESKTOP) as page:
+        desk.plan = lambda: ()
+        desk.resume = lambda who, given: given.session
         await page.get_by_role("button", name="Resume").click()
-        await until(lambda: night.orders)
-        assert night.orders[-1][1:] == ("resume", {"session": "20261122T180000Z-validation"})
+        await until(lambda: desk.orders)
+        assert desk.orders[-1][1:] == ("resume", {"session": "20261122T180000Z-validation"})
