@@ -1,7 +1,7 @@
 """A session as files that any program opens: PNG, text, CSV or Parquet.
 
     OUT/README.txt                   what is where, and how cells are to be read
-    OUT/session.json                 the metadata
+    OUT/session.json                 the metadata, and in which state the files of the session were
     OUT/attachments/config.yaml ...  the attached files
     OUT/steps.csv, OUT/events.csv    and OUT/notes.csv, the notes that people wrote
     OUT/frames.csv                   every frame with its role, set-point, temperatures and stages (or .parquet)
@@ -27,6 +27,7 @@ from pathlib import Path
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import create_folder
 from thermostand.recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, format_sidecar, list_frame_facts
+from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
 from thermostand.recording.exporting.telemetry_tables import TIME_COLUMNS, write_telemetry
 from thermostand.recording.format.decoded_items import decode_frame
@@ -44,7 +45,7 @@ NOTE_COLUMNS = (Column("time_ns", "ns"), *(Column(name, "text") for name in ("by
 
 README = """What is here was exported from a recorded session of a thermal test stand by `stand session export`.
 
-session.json              what the session is: recipe, camera, operator, version, start
+session.json              what the session is: recipe, camera, operator, version; and the state of its files
 attachments/              configuration, recipe and target, as they were recorded
 steps.csv, events.csv     what was done, and what happened
 notes.csv                 the notes that people wrote about it, if there are any
@@ -54,9 +55,12 @@ originals/                the pictures of the thermal imager, if there is one, a
 frames/000001.png, .txt   each frame in order of time, and the temperatures at its time; index.csv has all of these
 
 Times    time_ns is the stand's clock, in ns since 1970: it never steps, so take differences of it. time_utc is UTC as
-         the computer had it at that moment.
+         the computer had it at that moment. time_ns has 19 digits, and spreadsheets round numbers to 15: read the
+         column as text there, or use time_utc.
 Values   An empty cell is what the device does not measure; nan is what it could not measure, and remarks says why.
          Units are in the names of the columns. A number is the shortest text that reads back as the same number.
+         Decimals have a point, and columns a comma between them, whatever the country: import the tables with these
+         settings where a spreadsheet expects other ones.
          Thermometers of a laboratory's own names have columns as the others do (telemetry/sensors_temperature).
 Frames   Columns of frames.csv: file (the image here, else the recorded segment that has it); camera; step_id, the step
          of the plan that took it; role, what for; superseded, yes when the capture was begun again later;
@@ -133,8 +137,9 @@ class _ExportProgress:
 def _write_facts(session: Session, folder: Path) -> None:
     """What is small: metadata, attachments, steps and events."""
     utc = session.utc
-    (folder / "README.txt").write_text(README, encoding="utf-8")
-    text = json.dumps(session.metadata, indent=2, ensure_ascii=False)
+    state = describe_state(session)
+    (folder / "README.txt").write_text(README + state.text, encoding="utf-8")
+    text = json.dumps({**session.metadata, **state._asdict()}, indent=2, ensure_ascii=False)
     (folder / "session.json").write_text(text + "\n", encoding="utf-8")
     attachments = folder / "attachments"
     attachments.mkdir()

@@ -14,15 +14,25 @@ from mcap_protobuf.schema import register_schema
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import make_durable_folder, sync_folder
+from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.topics import iterate_recorded_messages, list_topics
 from thermostand.recording.format.images import name_frame_topics
+from thermostand.recording.format.journal_lines import JOURNAL_NAME
 from thermostand.recording.format.layout import SEQUENCE_MASK, SESSION_METADATA
+from thermostand.recording.format.manifest import MANIFEST_NAME
+from thermostand.recording.format.mcap_contents import EXPORT_LIBRARY
 from thermostand.recording.format.records import RecordedMessage
 from thermostand.recording.reading.notes import NOTES_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.segment import Topic
 from thermostand.recording.writing.session_spec import make_frames_topic
 
+# With them `stand session import` makes the same session again.
+_FILES = {
+    JOURNAL_NAME: "application/jsonl",
+    NOTES_NAME: "application/jsonl",
+    MANIFEST_NAME: "application/json",
+}
 _CHUNK_BYTES = 1 << 22  # round number; nothing was measured
 
 
@@ -63,13 +73,16 @@ def _write(
     found: Iterator[RecordedMessage],
     report: Callable[[float, str], None],
 ) -> None:
-    writer.start(library="thermostand")
+    writer.start(library=EXPORT_LIBRARY)
     for name, text in session.attachments.items():
         writer.add_attachment(0, 0, name, "application/yaml" if name.endswith(".yaml") else "text/plain", text.encode())
-    notes = session.path / NOTES_NAME
-    if notes.is_file() and not notes.is_symlink():
-        writer.add_attachment(0, 0, NOTES_NAME, "application/jsonl", notes.read_bytes())
+    for name, media_type in _FILES.items():
+        path = session.path / name
+        if path.is_file() and not path.is_symlink():
+            writer.add_attachment(0, 0, name, media_type, path.read_bytes())
     writer.add_metadata(SESSION_METADATA, session.metadata)
+    state = describe_state(session)
+    writer.add_metadata("export", {"files": state.files, "findings": "\n".join(state.findings)})
     topics = {topic.name: topic for topic in list_topics(session)}
     channels: dict[str, int] = {}
     times = session.frame_times_ns
@@ -78,7 +91,8 @@ def _write(
         topic = message.topic
         if topic not in channels:
             channels[topic] = _register_channel(writer, topics.get(topic) or make_frames_topic(topic))
-        writer.add_message(channels[topic], message.time_ns, message.data, message.time_ns, message.sequence)
+        published_ns = message.published_ns or message.time_ns
+        writer.add_message(channels[topic], message.time_ns, message.data, published_ns, message.sequence)
         if end_ns > begin_ns:
             report(min(1.0, max(0.0, (message.time_ns - begin_ns) / (end_ns - begin_ns))), "messages")
     writer.finish()
@@ -98,6 +112,8 @@ def _merge_messages(session: Session, frames: bool, telemetry: bool) -> Iterator
 
 def _iterate_frame_messages(session: Session) -> Iterator[RecordedMessage]:
     for image in session.images():
-        topics, sequence = name_frame_topics(image.meta.channel), image.meta.block_id & SEQUENCE_MASK
-        yield RecordedMessage(topics.meta, sequence, image.time_ns, image.description)
-        yield RecordedMessage(topics.image, sequence, image.time_ns, bytes(image.data))
+        topics, meta = name_frame_topics(image.meta.channel), image.meta
+        for topic, data in ((topics.meta, image.description), (topics.image, bytes(image.data))):
+            yield RecordedMessage(
+                topic, meta.block_id & SEQUENCE_MASK, image.time_ns, data, published_ns=meta.published_ns
+            )

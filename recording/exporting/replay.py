@@ -25,6 +25,7 @@ from thermostand.foundation.workers import WorkerThread
 from thermostand.recording.exporting.topics import recorded_devices
 from thermostand.recording.format.holes import format_holes
 from thermostand.recording.format.journal_lines import JOURNAL_NAME
+from thermostand.recording.reading.notes import NOTES_NAME
 from thermostand.recording.reading.session import Session
 from thermostand.recording.writing.recorder import Recorder, RecordingSettings, SessionInfo
 from thermostand.recording.writing.recorder_settings import VIRTUAL_COMMIT_S
@@ -96,8 +97,8 @@ async def replay_and_record(
     """Replay `session` and record it again as the session `out`, which must not exist; returns `out`.
 
     speed: times as fast as it was, None as fast as possible. `watch(hub)` may subscribe before the first item. The copy
-    has the same metadata (the session's id, too), attachments, devices, items and journal: nothing in it mentions the
-    replay, because it is the same session in other segments. What the original lacks is listed in its metadata.
+    has the same metadata (the session's id, too), attachments, devices, items, journal and notes. Nothing in it is
+    about the replay, for it is the same session in other segments. What the original lacks is in its metadata.
     SessionError when it has no items, or cannot be read or written whole, as on a disk that is slower than `speed`;
     `out` then does not appear.
     """
@@ -119,7 +120,7 @@ async def replay_and_record(
         try:
             await _run_with_background(replay(session, hub, clock), background)
         finally:
-            _copy_journal(session, folder)  # before the manifest is written last, which has its hash
+            _copy_texts(session, folder)  # before the manifest is written last, which has the hash of the journal
             await recorder.finish()
         if recorder.frames_lost:
             raise SessionError(
@@ -143,11 +144,11 @@ async def _run_with_background(
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _copy_journal(session: Session, folder: Path) -> None:
-    """The run's journal, where there is one; it is as good as it was."""
-    journal = session.path / JOURNAL_NAME
-    if journal.is_file():
-        shutil.copyfile(journal, folder / JOURNAL_NAME)
+def _copy_texts(session: Session, folder: Path) -> None:
+    """The run's journal and the notes of people, where there are any; they are as good as they were."""
+    for name in (JOURNAL_NAME, NOTES_NAME):
+        if (session.path / name).is_file():
+            shutil.copyfile(session.path / name, folder / name)
 
 
 def _make_settings(commit_s: float) -> RecordingSettings:

@@ -7,7 +7,7 @@ of the stand's clock to UTC when there was one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from thermostand.recording.format import messages
 from thermostand.recording.format.holes import format_holes
 from thermostand.recording.format.images import ZSTD_LEVEL, name_frame_topics
 from thermostand.recording.format.layout import FRAMES, TELEMETRY
+from thermostand.recording.format.manifest import Sealed
 from thermostand.recording.format.records import FramePlace, list_frame_places, read_frame
 from thermostand.recording.format.utc_offsets import make_offset_event
 from thermostand.recording.reading.run_status import Extent, parse_extent
@@ -140,15 +141,16 @@ def _write_telemetry(
     topics = {topic.name: topic for topic in list_topics(session)}
     for name in (messages.EVENT, messages.LOG, messages.STEP):
         topics.setdefault(name, Topic(name, messages.CLASSES[name]))
-    series = _open_series(session, metadata, folder, tuple(topics.values()), CompressionType.ZSTD)
+    series = open_series(session.attachments, metadata, folder, tuple(topics.values()), CompressionType.ZSTD)
     now_ns = first_ns
-    for block in _split_into_blocks(records):
+    for block in split_into_blocks(records):
         now_ns = max(now_ns, block[-1].time_ns)
-        _commit(series, block, now_ns)
-    _finish(series)
+        commit(series, block, now_ns)
+    finish(series)
 
 
-def _split_into_blocks(records: Iterator[MessageRecord]) -> Iterator[list[MessageRecord]]:
+def split_into_blocks(records: Iterator[MessageRecord]) -> Iterator[list[MessageRecord]]:
+    """Records of telemetry as they are committed together."""
     block: list[MessageRecord] = []
     size_bytes = 0
     for record in records:
@@ -167,7 +169,7 @@ def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, p
         return
     channels = dict.fromkeys(place.meta.channel for place in places)
     topics = tuple(make_frames_topic(name) for channel in channels for name in name_frame_topics(channel))
-    series = _open_series(session, metadata, folder, topics, CompressionType.ZSTD, ZSTD_LEVEL)
+    series = open_series(session.attachments, metadata, folder, topics, CompressionType.ZSTD, ZSTD_LEVEL)
     for place in places:
         names, stored, meta = name_frame_topics(place.meta.channel), read_frame(place), place.meta
         stamps = place.sequence, meta.published_ns
@@ -175,42 +177,44 @@ def _write_frames(session: Session, metadata: Mapping[str, str], folder: Path, p
             MessageRecord(names.meta, meta.time_ns, stored.meta, *stamps),
             MessageRecord(names.image, meta.time_ns, stored.image, *stamps),
         ]
-        _commit(series, records, place.time_ns)
-    _finish(series)
+        commit(series, records, place.time_ns)
+    finish(series)
 
 
-def _open_series(
-    session: Session,
+def open_series(
+    attachments: Mapping[str, str],
     metadata: Mapping[str, str],
     folder: Path,
     topics: tuple[Topic, ...],
     compression: CompressionType,
     level: int = 3,
+    seal: Callable[[str, Sealed], None] | None = None,
 ) -> Series:
+    """A series of a copy in `folder`, which is made; `seal` is called with each segment."""
     folder.mkdir(exist_ok=True)
     usual = RecordingSettings()
     segment_ns = to_ns(usual.segment_s)
-    texts, size_bytes = session.attachments, usual.segment_bytes
     form = SeriesSpec(
         name=folder.name,
         topics=topics,
         compression=compression,
         session=metadata,
-        attachments=texts,
-        segment_bytes=size_bytes,
+        attachments=attachments,
+        segment_bytes=usual.segment_bytes,
         segment_ns=segment_ns,
         level=level,
     )
-    return Series(folder, form)
+    return Series(folder, form, seal)
 
 
-def _commit(series: Series, records: list[MessageRecord], now_ns: int) -> None:
+def commit(series: Series, records: list[MessageRecord], now_ns: int) -> None:
     """Commit, or raise what a recorder would overcome: a copy that went half wrong is begun again, not mended."""
     series.commit(records, now_ns)
     if series.troubles:
         raise OSError(series.troubles.popleft())
 
 
-def _finish(series: Series) -> None:
+def finish(series: Series) -> None:
+    """Finish the last segment; OSError when the disk refuses."""
     if not series.finish():
         raise OSError(series.troubles.popleft())

@@ -68,14 +68,14 @@ def list_segments(directory: Path) -> tuple[SegmentFile, ...]:
 
 
 def list_strays(directory: Path) -> tuple[str, ...]:
-    """What lies among the segments, is called as if it were one, and is none: a copy (`0003 (1).mcap`, `00003.mcap`),
-    what another system leaves (`._0003.mcap`), or no file. It counts for nothing."""
+    """What lies among the segments or next to their folders, is called as if it were one, and is none: a copy
+    (`0003 (1).mcap`, `00003.mcap`), what another system leaves (`._0003.mcap`), or no file. It counts for nothing."""
     found: list[str] = []
-    for series in (TELEMETRY, FRAMES):
+    for series in ("", TELEMETRY, FRAMES):
         with suppress(OSError):
             names = [path.name for path in (directory / series).iterdir() if path.name.endswith(tuple(_STATE))]
-            known = {file.path.name for file in _list_series(directory / series)}
-            found += [f"{series}/{name}" for name in sorted(set(names) - known)]
+            known = {file.path.name for file in _list_series(directory / series)} if series else set[str]()
+            found += [f"{series}/{name}".lstrip("/") for name in sorted(set(names) - known)]
     return tuple(found)
 
 

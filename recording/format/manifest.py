@@ -67,11 +67,13 @@ class SessionInfo:
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """A finished segment: its size, the SHA-256 of all its bytes, and how many messages it has of each topic."""
+    """A finished segment: its size, the SHA-256 of all its bytes, how many messages it has of each topic, and their
+    digest (mcap_contents.py), which stays when another program writes the file in another form; "" is not stated."""
 
     size_bytes: int
     sha256: str
     messages: Mapping[str, int]
+    content: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +170,11 @@ def _build_manifest(stated: Mapping[str, Any]) -> Manifest:
     segments = {str(name): Sealed(**each) for name, each in stated["segments"].items()}
     journal = None if stated["journal"] is None else JournalDigest(**stated["journal"])
     devices = {str(name): dict(each) for name, each in stated["devices"].items()}
-    texts = [*stated["session"].values(), *stated["texts"].values(), *(each.sha256 for each in segments.values())]
+    texts = [
+        *stated["session"].values(),
+        *stated["texts"].values(),
+        *(text for each in segments.values() for text in (each.sha256, each.content)),
+    ]
     counts = [*stated["plan"].values(), *(count for each in segments.values() for count in each.messages.values())]
     counts += [each.size_bytes for each in segments.values()] + ([journal.lines, journal.size_bytes] if journal else [])
     if not all(isinstance(text, str) for text in texts) or not all(isinstance(count, int) for count in counts):

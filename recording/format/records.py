@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -21,8 +24,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.format.batches import READINGS, BatchSchema, parse_batch_schema
-from thermostand.recording.format.damage import FileDamaged, convert_damage, name_file_in_errors
+from thermostand.recording.format.damage import DAMAGE, FileDamaged, convert_damage, name_file_in_errors
 from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
+from thermostand.recording.format.inventory import SegmentState, list_segments
 from thermostand.recording.format.layout import (
     FRAME_TABLE,
     SALVAGE_METADATA,
@@ -42,6 +46,7 @@ from thermostand.recording.format.mcap_bytes import (
     make_stream,
     parse_chunk_head,
 )
+from thermostand.recording.format.mcap_contents import McapContents, find_rewritten
 from thermostand.recording.format.messages import CLASSES, FrameMeta, decode_frame_meta, decode_frame_table
 from thermostand.recording.format.summary import ChunkPlace, Summary, read_summary
 
@@ -57,13 +62,15 @@ _MESSAGE_BYTES = _MESSAGE_START.size + _MESSAGE_REST.size  # with the record's h
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """One message as it is in the file; `data` is still encoded. form: of the readings of a device."""
+    """One message as it is in the file; `data` is still encoded. form: of the readings of a device. published_ns: 0
+    when it is the log time, or not asked for."""
 
     topic: str
     sequence: int
     time_ns: int
     data: bytes
     form: BatchSchema | None = None
+    published_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,22 +85,34 @@ class MessageSpan:
 @dataclass(frozen=True, slots=True)
 class Head:
     """The first records of a segment. place: the record `segment`, its place in the session; salvaged: the record
-    `repair`, empty for a segment that its recorder finished itself; span: by its index."""
+    `repair`, empty for a segment that its recorder finished itself; span: by its index. rewritten: all that is in
+    a segment which another program has written."""
 
     session: dict[str, str]
     attachments: dict[str, str]
     place: dict[str, str]
     salvaged: dict[str, str]
     span: MessageSpan
+    rewritten: McapContents | None = None
+
+
+class RewrittenFrame(NamedTuple):
+    """Where the two messages of a frame are in a segment that another program has written: their numbers there."""
+
+    contents: McapContents
+    meta: int
+    image: int
 
 
 @dataclass(frozen=True, slots=True)
 class FramePlace:
-    """A frame by its identity: its segment, its chunk there, and its description."""
+    """A frame by its identity: its segment, its chunk there, and its description. rewritten: where it is instead in a
+    segment of another program, of which `chunk` only has the instants and the size."""
 
     path: Path
     chunk: ChunkPlace
     meta: FrameMeta
+    rewritten: RewrittenFrame | None = None
 
     @property
     def time_ns(self) -> int:
@@ -108,12 +127,52 @@ class FramePlace:
 
 def read_head(path: Path) -> Head:
     """Metadata `session` and the attachments of a finished segment."""
+    with convert_damage(path):
+        if (rewritten := find_rewritten(path)) is not None:
+            return _make_head(rewritten)
     with convert_damage(path), path.open("rb") as file:
         summary = _open(path, file)
         head = _read_head(path, file, summary)
         if len(head.attachments) != summary.statistics.attachment_count - (FRAME_TABLE in summary.parse_attachments()):
             raise ValueError("its attachments are not those that its index lists")
         return head
+
+
+def _make_head(found: McapContents) -> Head:
+    """The head of a segment that another program has written."""
+    path, metadata = found.path, found.metadata
+    if SESSION_METADATA not in metadata:
+        raise SessionError(f"{path}: {explain_stranger(found)}")
+    texts = {name: each.data.decode() for name, each in found.attachments.items() if name != FRAME_TABLE}
+    return Head(
+        session=metadata[SESSION_METADATA],
+        attachments=texts,
+        place=metadata.get(SEGMENT_METADATA, {}),
+        salvaged=metadata.get(SALVAGE_METADATA, {}),
+        span=MessageSpan(len(found), found.first_ns, found.last_ns),
+        rewritten=found,
+    )
+
+
+def explain_stranger(found: McapContents) -> str:
+    """What a valid MCAP file is that does not say of which session it is, as the part of a sentence."""
+    return (
+        f"is a valid MCAP file written by {found.program}, without the record {SESSION_METADATA!r} of a recording; it "
+        "counts for nothing and is left alone"
+    )
+
+
+def find_strangers(directory: Path) -> dict[str, str]:
+    """The valid MCAP files of other programs among a session's segments that say nothing of a session: name -> what
+    they are, as the part of a sentence."""
+    found: dict[str, str] = {}
+    for file in list_segments(directory):
+        if file.state is SegmentState.FINISHED:
+            with suppress(*DAMAGE):
+                contents = find_rewritten(file.path)
+                if contents is not None and SESSION_METADATA not in contents.metadata:
+                    found[file.name] = explain_stranger(contents)
+    return found
 
 
 def _open(path: Path, file: BinaryIO) -> Summary:
@@ -164,6 +223,10 @@ def _parse_metadata(content: bytes) -> tuple[str, Mapping[str, str]]:
 
 def read_telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> Iterator[RecordedMessage]:
     """The messages of the wanted channels of a telemetry segment, in the order of the file."""
+    with convert_damage(path):
+        if (rewritten := find_rewritten(path)) is not None:
+            yield from iterate_rewritten(rewritten, wanted)
+            return
     with convert_damage(path), path.open("rb") as file:
         summary = _open(path, file)
         topics = {
@@ -183,9 +246,27 @@ def read_telemetry_messages(path: Path, wanted: Callable[[Channel], bool]) -> It
             raise ValueError("it does not hold the messages that its index lists")
 
 
+def iterate_rewritten(found: McapContents, wanted: Callable[[Channel], bool]) -> Iterator[RecordedMessage]:
+    """The same of a segment that another program has written, but for frames; one of DAMAGE where it is no telemetry of
+    ours."""
+    channels = _check_channels({number: (each, found.get_schema(number)) for number, each in found.channels.items()})
+    forms = {
+        number: (channel.topic, find_batch_schema(channel))
+        for number, (channel, schema) in channels.items()
+        if wanted(channel) and schema not in (META_SCHEMA, IMAGE_SCHEMA)
+    }
+    for message in found.iterate_messages(forms):
+        topic, form = forms[message.channel]
+        yield RecordedMessage(topic, message.sequence, message.log_time_ns, bytes(message.data), form)
+
+
 def _map_channels(summary: Summary) -> dict[int, tuple[Channel, str]]:
-    """Channel id -> channel and schema; ValueError when a topic of ours holds messages that are not."""
-    channels = summary.channels()
+    """Channel id -> channel and schema."""
+    return _check_channels(summary.channels())
+
+
+def _check_channels(channels: dict[int, tuple[Channel, str]]) -> dict[int, tuple[Channel, str]]:
+    """The channels; ValueError when a topic of ours holds messages that are not."""
     for channel, schema in channels.values():
         form = find_batch_schema(channel)
         known = SCHEMAS.get(channel.topic) if form is None else form.message.DESCRIPTOR.full_name
@@ -253,7 +334,10 @@ def _make_message(topic: str, form: BatchSchema | None, chunk: memoryview, offse
 
 def list_frame_places(path: Path) -> list[FramePlace]:
     """The frames of a segment in the order of the file, from its table of them; no image is decompressed unless
-    another program has written the file without one."""
+    another program has written the file."""
+    with convert_damage(path):
+        if (rewritten := find_rewritten(path)) is not None:
+            return list_rewritten_frames(rewritten)
     with convert_damage(path), path.open("rb") as file:
         summary = _open(path, file)
         chunks = list(summary.iterate_chunks())
@@ -276,6 +360,34 @@ def list_frame_places(path: Path) -> list[FramePlace]:
         return places
 
 
+def list_rewritten_frames(found: McapContents) -> list[FramePlace]:
+    """The frames of a segment that another program has written; ValueError when it has one without its other half."""
+    topics = {
+        number: (channel.topic.rpartition("/")[0], schema)
+        for number, channel in found.channels.items()
+        if (schema := found.get_schema(number)) in (META_SCHEMA, IMAGE_SCHEMA)
+    }
+    halves: dict[tuple[str, str, int, int], list[int]] = {}
+    for index, channel in enumerate(found.channel_of):
+        if channel in topics:
+            sequence = found.read_message(index).sequence
+            halves.setdefault((*topics[channel], found.time_ns_of[index], sequence), []).append(index)
+    places: list[tuple[int, FramePlace]] = []
+    for (camera, schema, time_ns, sequence), metas in halves.items():
+        other = IMAGE_SCHEMA if schema == META_SCHEMA else META_SCHEMA
+        images = halves.get((camera, other, time_ns, sequence), [])
+        if len(metas) != len(images):
+            raise ValueError(f"a frame of {camera} has no {'image' if schema == META_SCHEMA else 'description'}")
+        for meta, image in zip(metas, images, strict=True) if schema == META_SCHEMA else ():
+            description = decode_frame_meta(bytes(found.read_message(meta).data))
+            channels = found.channel_of[meta], found.channel_of[image]
+            chunk = ChunkPlace(time_ns, time_ns, found.place_of[meta], found.length_of[image], channels)
+            places.append(
+                (min(meta, image), FramePlace(found.path, chunk, description, RewrittenFrame(found, meta, image)))
+            )
+    return [place for _, place in sorted(places, key=itemgetter(0))]
+
+
 def _read_attachment(file: BinaryIO, offset: int, length: int) -> Attachment:
     data = _read_exactly(file, offset, length)
     if RECORD.unpack_from(data) != (Opcode.ATTACHMENT, length - RECORD.size):
@@ -285,9 +397,13 @@ def _read_attachment(file: BinaryIO, offset: int, length: int) -> Attachment:
 
 
 def read_frame_crcs(path: Path, places: Sequence[FramePlace]) -> list[int]:
-    """Read the CRCs that the heads of their chunks state for frames of one segment; no frame is read."""
+    """Read the CRCs that the heads of their chunks state for frames of one segment; no frame is read, but those that
+    another program has written."""
     with convert_damage(path), path.open("rb", buffering=0) as file:
-        return [_read_frame_head(file, place.chunk).crc for place in places]
+        return [
+            zlib.crc32(read_frame(place).image) if place.rewritten else _read_frame_head(file, place.chunk).crc
+            for place in places
+        ]
 
 
 def _read_frame_head(file: BinaryIO, chunk: ChunkPlace) -> ChunkHead:
@@ -308,7 +424,11 @@ class StoredFrame(NamedTuple):
 def read_frame(place: FramePlace) -> StoredFrame:
     """The messages of the frame at that place, the CRC of its chunk checked."""
     with convert_damage(place.path), place.path.open("rb", buffering=0) as file:
-        meta, image = parse_frame_messages(_read_chunk(file, place.chunk))
+        meta, image = (
+            _read_rewritten(place.rewritten)
+            if place.rewritten
+            else parse_frame_messages(_read_chunk(file, place.chunk))
+        )
         with name_file_in_errors(place.path):
             stored = decode_frame_meta(bytes(meta.data))
         if repr(stored) != repr(place.meta):  # NaN is not equal to itself
@@ -317,6 +437,12 @@ def read_frame(place: FramePlace) -> StoredFrame:
         if any((message.time_ns, message.sequence) != stated for message in (meta, image)):
             raise ValueError("a frame's messages are not of one frame")
         return StoredFrame(bytes(meta.data), image.data)
+
+
+def _read_rewritten(place: RewrittenFrame) -> tuple[FrameMessage, FrameMessage]:
+    found = (place.contents.read_message(index) for index in (place.meta, place.image))
+    meta, image = (FrameMessage(each.sequence, each.log_time_ns, memoryview(each.data)) for each in found)
+    return meta, image
 
 
 class FrameMessage(NamedTuple):

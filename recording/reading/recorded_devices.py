@@ -10,6 +10,7 @@ from mcap.records import Channel
 
 from thermostand.recording.format.batches import READINGS, RecordedDevice, parse_batch_schema
 from thermostand.recording.format.damage import convert_damage
+from thermostand.recording.format.mcap_contents import find_rewritten
 from thermostand.recording.format.summary import read_summary
 
 
@@ -32,6 +33,10 @@ def recorded_channels(telemetry: Iterable[Path]) -> list[Channel]:
     channels: list[Channel] = []
     for path in telemetry:
         with convert_damage(path), path.open("rb") as file:
-            numbered = read_summary(file, path.stat().st_size).channels()
+            rewritten = find_rewritten(path)
+            if rewritten is not None:
+                numbered = {number: (channel, "") for number, channel in rewritten.channels.items()}
+            else:
+                numbered = read_summary(file, path.stat().st_size).channels()
         channels += [numbered[number][0] for number in sorted(numbered)]
     return channels

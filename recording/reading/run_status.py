@@ -29,11 +29,13 @@ class RunOutcome(StrEnum):
 
 class Files(StrEnum):
     """sound: everything that was acknowledged is there and as it was written. incomplete: something of it is missing.
-    damaged: something is not as it was written. unknown: by another version, whose format this one does not know."""
+    damaged: something is not as it was written. changed: another program has written other content. unknown: by another
+    version, whose format this one does not know."""
 
     SOUND = "sound"
     INCOMPLETE = "incomplete"
     DAMAGED = "damaged"
+    CHANGED = "changed"
     UNKNOWN = "unknown"
 
 

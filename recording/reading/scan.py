@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -63,8 +64,15 @@ from thermostand.recording.format.layout import (
 )
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, NoManifest, SessionInfo, read_manifest
 from thermostand.recording.format.mcap_bytes import Source
+from thermostand.recording.format.mcap_contents import McapContents
 from thermostand.recording.format.messages import FrameMeta, decode_frame_meta
-from thermostand.recording.format.records import RecordedMessage, list_frame_places, read_head, read_telemetry_messages
+from thermostand.recording.format.records import (
+    RecordedMessage,
+    find_strangers,
+    list_frame_places,
+    read_head,
+    read_telemetry_messages,
+)
 from thermostand.recording.format.utc_offsets import REPEATED_NS, UtcOffsets, collect_offsets
 from thermostand.recording.reading.gaps import count_lost_frames, find_silences, list_reported_blocks
 from thermostand.recording.reading.notes import NOTES_NAME, read_notes
@@ -75,12 +83,13 @@ from thermostand.recording.reading.run_status import (
     find_last_run_event,
     parse_extent,
 )
-from thermostand.recording.reading.segment_check import SegmentDamage, check_segment
+from thermostand.recording.reading.segment_check import SegmentDamage, check_segment, judge_rewritten
 from thermostand.recording.reading.segment_scan import scan_segment
 
 Report = Callable[[float, str], None]
 NO_TEMPERATURE = "no frame has a good camera temperature"
 CAPTURE = "capture"
+_GRAVEST_FIRST = (Files.DAMAGED, Files.CHANGED, Files.INCOMPLETE, Files.UNKNOWN)
 # The journal may be ahead of telemetry that waits for its next commit, on a virtual clock for 20 s.
 # Three commits of virtual time; a journal that is further ahead has lost telemetry.
 AHEAD_NS = 60 * NS_PER_S
@@ -168,7 +177,8 @@ class Recorded:
 @dataclass
 class ScannedSegment:
     """A finished segment, as far as it was read: its records, its texts, how many messages it has and between which
-    instants. sha256: of its bytes, "" when not all were read. damages: what is wrong with it."""
+    instants. sha256: of its bytes, "" when not all were read. rewritten: the contents of one that another program has
+    written. damages: what is wrong with it."""
 
     file: SegmentFile
     session: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -179,6 +189,7 @@ class ScannedSegment:
     first_ns: float = inf
     last_ns: float = -inf
     sha256: str = ""
+    rewritten: McapContents | None = None
     damages: list[SegmentDamage] = field(default_factory=list[SegmentDamage])
 
     @property
@@ -219,7 +230,7 @@ class Scan:
     def files(self) -> Files:
         """The gravest of what was found."""
         words = {finding.files for finding in self.findings}
-        return next((word for word in (Files.DAMAGED, Files.INCOMPLETE, Files.UNKNOWN) if word in words), Files.SOUND)
+        return next((word for word in _GRAVEST_FIRST if word in words), Files.SOUND)
 
     @property
     def is_sound(self) -> bool:
@@ -257,6 +268,22 @@ class Scan:
         return sum(file.state is state for file in self.inventory)
 
 
+_ALIKE = 10  # lines that differ in numbers only; more of them are one line with a count
+
+
+def summarise_findings(findings: Iterable[SessionFinding]) -> list[str]:
+    """The findings as lines. Where more than ten differ in nothing but numbers, the first stands for all of them."""
+    lines = [str(finding) for finding in findings]
+    kinds = [re.sub(r"\d+", "0", line) for line in lines]
+    counts, found = Counter(kinds), dict[str, str]()
+    for line, kind in zip(lines, kinds, strict=True):
+        if counts[kind] <= _ALIKE:
+            found[line] = line
+        else:
+            found.setdefault(kind, f"{line} (and {counts[kind] - 1} more like this)")
+    return list(found.values())
+
+
 def _no_report(share: float, text: str) -> None:
     """No progress is shown."""
 
@@ -272,10 +299,11 @@ def verify(path: Path, report: Report = _no_report) -> Scan:
 def scan(path: Path, depth: Depth = Depth.ENDS, report: Report = _no_report) -> Scan:
     """The session in `path`, as far as `depth` says; as `verify`. Where its ends show fewer frames than its plan, and
     nothing that explains it, its steps are read as well."""
-    files = list_segments(path)
+    strangers = find_strangers(path)
+    files = tuple(file for file in list_segments(path) if file.name not in strangers)
     if not files:
         raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
-    look = _SessionScanner(path, files, depth)
+    look = _SessionScanner(path, files, strangers, depth)
     look.read(report)
     found = look.build_result()
     is_quiet = found.is_sound and not any(file.state is SegmentState.RECORDING for file in files)
@@ -296,9 +324,10 @@ def _is_near(channel: Channel) -> bool:
 class _SessionScanner:
     """One look at a session: what was read of it, and then what that means."""
 
-    def __init__(self, path: Path, files: tuple[SegmentFile, ...], depth: Depth) -> None:
+    def __init__(self, path: Path, files: tuple[SegmentFile, ...], strangers: Mapping[str, str], depth: Depth) -> None:
         self._path = path
         self._files = files
+        self._strangers = strangers
         self._depth = depth
         self._seen: list[ScannedSegment] = []
         self._recorded = Recorded()
@@ -332,7 +361,7 @@ class _SessionScanner:
                 head.salvaged,
                 head.attachments,
             )
-            seen.messages, span = head.span.count, head.span
+            seen.messages, span, seen.rewritten = head.span.count, head.span, head.rewritten
             if span.count:
                 seen.first_ns, seen.last_ns = span.first_ns, span.last_ns
         return seen
@@ -380,6 +409,7 @@ class _SessionScanner:
             first_ns=check.first_ns,
             last_ns=check.last_ns,
             sha256=check.sha256,
+            rewritten=check.rewritten,
             damages=[*check.damages, *unreadable],
         )
 
@@ -453,6 +483,8 @@ class _SessionScanner:
         yield from self._find_unfinished()
         for name in list_strays(self._path):
             yield _make_note("is no segment by its name, or no file; it counts for nothing", name)
+        for name, text in self._strangers.items():
+            yield _make_note(text, name)
         yield from self._find_missing()
         for each in self._seen:
             for damage in each.damages:
@@ -476,12 +508,13 @@ class _SessionScanner:
 
     def _find_unfinished(self) -> Iterator[SessionFinding]:
         by_name = {each.file.name: each for each in self._seen}
+        kept = Counter((file.series, file.number) for file in self._files if file.state is SegmentState.DAMAGED)
         for file in self._files:
             match file.state:
                 case SegmentState.UNFINISHED:
                     yield _make_missing("is not finished; `stand session repair` recovers what is in it", file.name)
                 case SegmentState.DAMAGED if _is_recovered(
-                    file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}")
+                    file, by_name.get(f"{file.series}/{file.number:04d}{FINISHED}"), kept[file.series, file.number] == 1
                 ):
                     yield _make_note(
                         "a repair recovered every message and kept the original because it was finished and damaged; "
@@ -603,6 +636,11 @@ class _SessionScanner:
             return None  # a finding already
         if known is None and self._is_recording:
             return None
+        is_same_size = known is not None and known.size_bytes == each.file.size_bytes  # a bit of the header is wrong
+        if each.rewritten is not None and not is_same_size and (known is not None or not stated.ended):
+            found = judge_rewritten(each.rewritten, known)
+            severity = Severity.NOTE if found.files is Files.SOUND else Severity.ERROR
+            return SessionFinding(severity, name, found.text, found.files)
         if known is not None and known.size_bytes == each.file.size_bytes and each.sha256 in ("", known.sha256):
             return None
         if each.salvage or (known is None and not stated.ended):
@@ -941,10 +979,15 @@ def _explain_lost_end(
     return ""
 
 
-def _is_recovered(kept: SegmentFile, salvaged: ScannedSegment | None) -> bool:
-    """Whether the repaired segment has every message of the original: its repair lost no byte, and both have as many.
-    The original must reach the end of its data; of one that was cut short the number of messages is unknown."""
-    if salvaged is None or salvaged.salvage.get("lost_bytes") != "0":
+def _is_recovered(kept: SegmentFile, salvaged: ScannedSegment | None, is_first: bool) -> bool:
+    """Whether the repaired segment has every message of the original: as many as its recorder had listed (of the first
+    repair that kept one: what was listed later had been repaired), or its repair lost no byte, and both have as many.
+    The original must then reach the end of its data; of one that was cut short the number of messages is unknown."""
+    if salvaged is None:
+        return False
+    if is_first and salvaged.salvage.get("listed") == str(salvaged.messages):
+        return True
+    if salvaged.salvage.get("lost_bytes") != "0":
         return False
     count = 0
     with suppress(*DAMAGE), kept.path.open("rb") as file:

@@ -37,6 +37,7 @@ from mcap.writer import MCAP0_MAGIC
 from thermostand.recording.format.damage import DAMAGE
 from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA
 from thermostand.recording.format.layout import FRAME_TABLE, SEGMENT_METADATA, SESSION_METADATA, is_contradicting
+from thermostand.recording.format.manifest import Sealed
 from thermostand.recording.format.mcap_bytes import (
     CHUNK,
     CRC,
@@ -50,9 +51,16 @@ from thermostand.recording.format.mcap_bytes import (
     iterate_records,
     make_stream,
 )
+from thermostand.recording.format.mcap_contents import McapContents, find_rewritten
 from thermostand.recording.format.messages import encode_frame_table
-from thermostand.recording.format.records import RecordedMessage, find_batch_schema
+from thermostand.recording.format.records import (
+    RecordedMessage,
+    find_batch_schema,
+    iterate_rewritten,
+    list_rewritten_frames,
+)
 from thermostand.recording.format.summary import Summary, read_summary
+from thermostand.recording.reading.run_status import Files
 
 _DATA_END_BYTES = RECORD.size + CRC.size
 _PART_LIMIT_BYTES = RECORD_LIMIT_BYTES + (1 << 24)  # the indexes of its messages stand behind a chunk
@@ -69,7 +77,8 @@ class SegmentDamage(NamedTuple):
 @dataclass
 class SegmentCheck:
     """What the walk through a segment found. texts: what is attached. descriptions: of its sound frames, as messages.
-    `last_ns`: log time of its latest sound message. sha256: of all its bytes, "" when something is damaged."""
+    `last_ns`: log time of its latest sound message. sha256: of all its bytes, "" when something is damaged. rewritten:
+    the contents of one that another program has written, which no rule of ours is for."""
 
     path: Path
     damages: list[SegmentDamage] = field(default_factory=list[SegmentDamage])
@@ -80,6 +89,7 @@ class SegmentCheck:
     first_ns: float = inf
     last_ns: float = -inf
     sha256: str = ""
+    rewritten: McapContents | None = None
 
 
 def check_segment(
@@ -90,6 +100,13 @@ def check_segment(
     Damage is not raised: it is listed, and the walk continues at the next place in the index."""
     check = SegmentCheck(path)
     try:
+        check.rewritten = find_rewritten(path)
+        if check.rewritten is not None:
+            _take_rewritten(check, check.rewritten, receive)
+            with path.open("rb") as file:
+                check.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            report(check.rewritten.size_bytes)
+            return check
         with path.open("rb") as file:
             walk = _SegmentChecker(check, file, _read_index(read_summary(file, path.stat().st_size)), receive)
             walk.run(report)
@@ -99,6 +116,46 @@ def check_segment(
     except DAMAGE as error:
         check.damages.append(SegmentDamage(_format_error(error), -inf, inf))
     return check
+
+
+def _take_rewritten(check: SegmentCheck, found: McapContents, receive: Callable[[RecordedMessage], None]) -> None:
+    """What another program has written: all of it was read, and each CRC that it states is right."""
+    check.metadata = dict(found.metadata)
+    check.texts = {
+        name: each.data.decode(errors="surrogateescape")
+        for name, each in found.attachments.items()
+        if name != FRAME_TABLE
+    }
+    check.messages = len(found)
+    if check.messages:
+        check.first_ns, check.last_ns = found.first_ns, found.last_ns
+    metas = [number for number in found.channels if found.get_schema(number) == META_SCHEMA]
+    check.descriptions = [bytes(message.data) for message in found.iterate_messages(metas)]
+    for message in iterate_rewritten(found, lambda channel: True):
+        receive(message)
+    list_rewritten_frames(found)  # each has both halves
+
+
+class RewrittenAs(NamedTuple):
+    """What a rewritten segment is against what was recorded. text: as the part of a sentence."""
+
+    files: Files
+    text: str
+
+
+def judge_rewritten(found: McapContents, known: Sealed | None) -> RewrittenAs:
+    """Whether a segment that another program has written still holds what was recorded, by what `session.json` lists of
+    it (None: nothing)."""
+    by = f"was rewritten by {found.program}"
+    if known is None or not known.content:
+        return RewrittenAs(Files.SOUND, f"{by}; whether it holds all that was recorded is not known")
+    if found.digest == known.content:
+        return RewrittenAs(Files.SOUND, f"{by}, complete: it holds each message as it was recorded")
+    archive = "take the segment from an archive, or from before it was rewritten"
+    fewer = {topic: count - found.counts.get(topic, 0) for topic, count in known.messages.items()}
+    if lacks := [f"{count} of {known.messages[topic]} on {topic}" for topic, count in fewer.items() if count > 0]:
+        return RewrittenAs(Files.INCOMPLETE, f"{by} and lacks messages: {', '.join(lacks)}; {archive}")
+    return RewrittenAs(Files.CHANGED, f"{by}, and its content was changed: it holds other messages; {archive}")
 
 
 def _format_error(error: Exception) -> str:

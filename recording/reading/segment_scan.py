@@ -48,6 +48,7 @@ from thermostand.recording.format.mcap_bytes import (
     make_stream,
     parse_chunk_head,
 )
+from thermostand.recording.format.mcap_contents import StoredMessage
 from thermostand.recording.format.summary import read_summary
 
 # Whether the bytes of one record prove that they are what the writer wrote.
@@ -425,16 +426,6 @@ class SoundChunk(NamedTuple):
 
     offset: int
     length: int
-
-
-class StoredMessage(NamedTuple):
-    """A message as it is in a chunk; `data` is still encoded."""
-
-    channel: int
-    sequence: int
-    log_time_ns: int
-    publish_time_ns: int
-    data: bytes
 
 
 @dataclass

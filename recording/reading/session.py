@@ -49,6 +49,7 @@ from thermostand.recording.format.records import (
     FramePlace,
     Head,
     RecordedMessage,
+    find_strangers,
     list_frame_places,
     read_head,
     read_telemetry_messages,
@@ -101,8 +102,8 @@ class Session:
     def open(cls, path: Path | str) -> Session:
         """The session in `path`, the directory that holds `telemetry` and `frames`; SessionError when there is none."""
         path = Path(path)
-        files = list_segments(path)
-        finished = [file for file in files if file.state is SegmentState.FINISHED]
+        files, strangers = list_segments(path), find_strangers(path)
+        finished = [file for file in files if file.state is SegmentState.FINISHED and file.name not in strangers]
         telemetry, frames = ([file.path for file in finished if file.series == name] for name in (TELEMETRY, FRAMES))
         if not telemetry and not path.is_dir():
             raise NotFound(f"{path}: {'is a file, not a folder' if path.exists() else 'no such folder'}")
@@ -331,6 +332,12 @@ class Session:
         """How its run ended, as far as it is recorded."""
         return self.scanned.run
 
+    def is_rewritten(self, segment: Path) -> bool:
+        """Whether another program has written a segment of the session."""
+        with suppress(SessionError):
+            return segment in self.segments and self._check(segment).rewritten is not None
+        return False
+
     def _check(self, segment: Path) -> Head:
         """Return the head of a segment; SessionError when that is not of this session, or not of this place in it."""
         if segment in self._heads:
@@ -386,12 +393,17 @@ def check_whole(session: Session, incomplete: Say | None = None) -> None:
     """Check as `open_whole` does that a session that is open is whole."""
     path = session.path
     _check_finished(path, incomplete)
+    rewritten = {file.name for file in session.scanned.inventory if session.is_rewritten(file.path)}
     missing = [hole.text(session.utc) for hole in session.holes if not hole.excused]
     for finding in session.scanned.findings:
         if finding.files is Files.DAMAGED and finding.where in ("", MANIFEST_NAME):
             raise SessionError(f"{path}: {finding.sentence}; take the session from its archive")
         if finding.files in (Files.INCOMPLETE, Files.UNKNOWN) and finding.where == MANIFEST_NAME:
             missing.append(finding.sentence)
+        if finding.where in rewritten and finding.files is not Files.SOUND:
+            if incomplete is None:
+                raise SessionError(f"{path}/{finding.sentence}")
+            incomplete(f"{path}/{finding.sentence}")
     if not missing:
         return
     more = [f"{len(missing) - _MOST} more"] if len(missing) > _MOST else []

@@ -3,8 +3,9 @@
 What proves itself (recording/reading/segment_scan.py) is copied message by message into a segment of the usual form,
 with a metadata record `repair` that says from what. The copy is written as `NNNN.mcap.tmp`, synced and renamed; only
 then the original goes. It goes when the copy holds all of it but a block that was being written and never acknowledged;
-else it stays, as `NNNN.mcap.damaged`. A repair that is killed is repeated, and one of a recording that is still
-under way (its recorder holds a lock on the segment) leaves that alone.
+else it stays, as `NNNN.mcap.damaged`. A valid segment that another program has written is left alone. A repair that is
+killed is repeated, and one of a recording that is still under way (its recorder holds a lock on the segment) leaves
+that alone.
 """
 
 from __future__ import annotations
@@ -39,9 +40,11 @@ from thermostand.recording.format.layout import (
     UNFINISHED,
     make_segment_metadata,
 )
-from thermostand.recording.format.manifest import MANIFEST_NAME
+from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, Sealed, read_manifest
 from thermostand.recording.format.mcap_bytes import Source
-from thermostand.recording.reading.segment_check import check_segment
+from thermostand.recording.format.mcap_contents import McapContents
+from thermostand.recording.format.records import find_strangers
+from thermostand.recording.reading.segment_check import check_segment, judge_rewritten
 from thermostand.recording.reading.segment_scan import SegmentScan, StoredMessage, read_stored_messages, scan_segment
 from thermostand.recording.writing.locks import lock
 from thermostand.recording.writing.manifest_file import complete_manifest
@@ -102,7 +105,8 @@ def find_opening(path: Path, own: SegmentScan) -> SegmentOpening | None:
 
 def list_segment_files(series: Path) -> list[Path]:
     """The finished and unfinished segments in a folder; none when there is no such folder."""
-    files = (file for file in list_segments(series.parent) if file.series == series.name)
+    strangers = find_strangers(series.parent)
+    files = (file for file in list_segments(series.parent) if file.series == series.name and file.name not in strangers)
     return [file.path for file in files if file.state is not SegmentState.DAMAGED and file.number <= _GREATEST]
 
 
@@ -213,6 +217,7 @@ class Salvaged:
     source: what was repaired. path: the finished segment, None when nothing could be recovered. messages: how many of
     `source` are in it. lost_bytes: in its damaged places; a block that was never acknowledged is not lost. reason:
     what was wrong, BEING_RECORDED when it was left alone. kept: the original, when something of it is not in the copy.
+    is_rewritten: another program has written the segment, which is valid and left alone; `reason` says what it holds.
     """
 
     source: Path
@@ -221,6 +226,7 @@ class Salvaged:
     lost_bytes: int
     reason: str
     kept: Path | None
+    is_rewritten: bool = False
 
 
 def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Salvaged]:
@@ -282,17 +288,28 @@ def _salvage_number(finished: Path, finished_too: bool, share: ShareProgress) ->
     """The finished segment of a number first: the unfinished one next to it is compared with what it holds."""
     part = finished.with_name(finished.name.replace(FINISHED, UNFINISHED))
     has_part = part.is_file()
-    if finished.is_file() and (finished_too or has_part) and not _is_sound(finished, share):
-        yield _salvage_segment(finished, share)
+    if finished.is_file() and (finished_too or has_part):
+        checked = check_segment(finished, lambda message: None, share.within(finished))
+        if checked.damages:
+            yield _salvage_segment(finished, share)
+        elif checked.rewritten is not None and finished_too:
+            yield _leave_rewritten(finished, checked.rewritten)
     share.finished(finished)
     if has_part:
         yield _salvage_segment(part, share)
         share.finished(part)
 
 
-def _is_sound(path: Path, share: ShareProgress) -> bool:
-    """Whether every byte of a finished segment is as it was written."""
-    return not check_segment(path, lambda message: None, share.within(path)).damages
+def _leave_rewritten(path: Path, found: McapContents) -> Salvaged:
+    """A valid segment that another program has written is not touched."""
+    said = judge_rewritten(found, _find_listed(path)).text
+    return Salvaged(path, path, len(found), 0, said, None, is_rewritten=True)
+
+
+def _find_listed(path: Path) -> Sealed | None:
+    """What `session.json` lists of a finished segment."""
+    stated = read_manifest(path.parent.parent)
+    return stated.segments.get(f"{path.parent.name}/{path.name}") if isinstance(stated, Manifest) else None
 
 
 @contextmanager
@@ -496,12 +513,16 @@ def _write_opening(writer: McapWriter, table: FrameTable, original: _Original) -
 
 
 def _make_salvage_metadata(original: _Original) -> dict[str, str]:
+    """What the record `repair` says. listed: how many messages its recorder listed of the segment."""
+    known = _find_listed(original.finished)
+    listed = {} if known is None else {"listed": str(sum(known.messages.values()))}
     return {
         "source": original.path.name,
         "reason": _explain(original),
         "messages": str(original.delivered),
         "lost_bytes": str(original.found.lost_bytes),
         "damaged_places": str(len(original.found.damages)),
+        **listed,
     }
 
 
@@ -557,6 +578,8 @@ def format_salvaged(salvaged: Salvaged) -> str:
     source = "/".join(salvaged.source.absolute().parts[-3:])
     if salvaged.reason == BEING_RECORDED:
         return f"{source}: left alone, it is being recorded"
+    if salvaged.is_rewritten:
+        return f"{source}: {salvaged.reason}"
     if salvaged.source.name == MANIFEST_NAME:
         return f"{source}: made of the segments that are there ({salvaged.reason})"
     outcome = f"{salvaged.messages} messages in {salvaged.path.name}" if salvaged.path else "nothing could be recovered"

@@ -28,10 +28,8 @@ from thermostand.recording.format.manifest import (
     digest_journal,
     read_manifest,
 )
+from thermostand.recording.format.mcap_contents import read_contents
 from thermostand.recording.format.records import Head, read_head
-from thermostand.recording.format.summary import read_summary
-
-_BLOCK_BYTES = 1 << 20
 
 
 class ManifestFile:
@@ -145,14 +143,6 @@ def _is_other_session(file: SegmentFile, manifest: Manifest) -> bool:
 
 def seal_segment(path: Path) -> Sealed:
     """A finished segment as it is; SessionError when it cannot be read."""
-    digest, size_bytes = hashlib.sha256(), 0
     with convert_damage(path), path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            digest.update(block)
-            size_bytes += len(block)
-        summary = read_summary(file, size_bytes)
-        counts = summary.statistics.channel_message_counts
-        topics: Counter[str] = Counter()
-        for number, (channel, _) in summary.channels().items():
-            topics[channel.topic] += counts.get(number, 0)
-    return Sealed(size_bytes, digest.hexdigest(), dict(+topics))
+        found = read_contents(path)
+        return Sealed(found.size_bytes, hashlib.file_digest(file, "sha256").hexdigest(), found.counts, found.digest)

@@ -31,9 +31,10 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import LIBRARY_IDENTIFIER, MCAP0_MAGIC, CompressionType
+from mcap.writer import MCAP0_MAGIC, CompressionType
 
 from thermostand.recording.format.mcap_bytes import CHUNK, CRC, LENGTH, MESSAGE, RECORD, encode_record
+from thermostand.recording.format.mcap_contents import LIBRARY, ContentDigest
 
 _MESSAGE = int(Opcode.MESSAGE)
 # Tested against mcap's own writer, byte for byte: of 11 to 15 ms for a raw frame more than half were its three copies.
@@ -60,7 +61,7 @@ class _Chunk:
 
 class McapWriter:
     """The records of one file, in blocks that `take` hands over. A chunk ends at `end_chunk`, or when it has more than
-    `chunk_bytes`; one without a message is not written. level: of zstd."""
+    `chunk_bytes`; one without a message is not written. level: of zstd. digest: of the messages that were added."""
 
     def __init__(self, compression: CompressionType, chunk_bytes: int, level: int = 3) -> None:
         self._compression = compression
@@ -77,8 +78,9 @@ class McapWriter:
         self._metadata_indexes: list[MetadataIndex] = []
         self._first_ns = self._last_ns = 0
         self._counts: defaultdict[int, int] = defaultdict(int)
+        self.digest = ContentDigest()
         self._write(MCAP0_MAGIC)
-        self._write(encode_record(Header("", LIBRARY_IDENTIFIER)))
+        self._write(encode_record(Header("", LIBRARY)))
 
     def take(self) -> list[bytes | memoryview]:
         """The parts since the last time, one behind the other; the chunk in progress is not among them."""
@@ -117,6 +119,7 @@ class McapWriter:
         self._channels.append(
             Channel(id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata=dict(entries))
         )
+        self.digest.know(self._channels[-1], self._schemas[schema - 1] if schema else None)
         self._add(encode_record(self._channels[-1]))
         return number
 
@@ -127,6 +130,7 @@ class McapWriter:
         self._first_ns = min(self._first_ns, log_time_ns) if self._counts else log_time_ns
         self._last_ns = max(self._last_ns, log_time_ns)
         self._counts[channel] += 1
+        self.digest.add(channel, log_time_ns, publish_time_ns, sequence, data)
         self._chunk.note(channel, log_time_ns)
         length = MESSAGE.size + len(data)
         self._add(_MESSAGE_HEAD.pack(_MESSAGE, length, channel, sequence, log_time_ns, publish_time_ns), data)

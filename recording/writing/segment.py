@@ -18,10 +18,9 @@ import errno
 import fcntl
 import hashlib
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,6 +52,7 @@ from thermostand.recording.format.mcap_bytes import (
     iterate_records,
     make_stream,
 )
+from thermostand.recording.format.mcap_contents import ContentDigest
 from thermostand.recording.format.messages import encode_frame_table
 from thermostand.recording.writing.mcap_writer import McapWriter
 from thermostand.recording.writing.notices import read_disk_space
@@ -158,9 +158,9 @@ class CommitSink:
             raise
         self.committed_bytes = end_bytes
 
-    def seal(self, messages: Mapping[str, int]) -> Sealed:
-        """What has been committed, as a whole file."""
-        return Sealed(self.committed_bytes, self._sha256.hexdigest(), dict(messages))
+    def seal(self, digest: ContentDigest) -> Sealed:
+        """What has been committed, as a whole file with these messages."""
+        return Sealed(self.committed_bytes, self._sha256.hexdigest(), dict(digest.counts), digest.hexdigest())
 
     def settle(self) -> None:
         """Cut the file to its committed blocks and give back the reserve, durably. Until that has succeeded a block
@@ -216,7 +216,6 @@ class Segment:
         self._writer = McapWriter(form.compression, CHUNK_BYTES, form.level)
         self._table = FrameTable(self._writer)
         self._chunk_count = 0
-        self._messages: Counter[str] = Counter()  # by topic
         self._sink = CommitSink(self._part, _compute_affordable_bytes(folder, form))
         try:
             sync_folder(folder)
@@ -262,7 +261,6 @@ class Segment:
                 channel = self._channels[record.topic] = self._add_late_topic(record.topic)
             self._writer.add_message(channel, time_ns, published_ns, record.sequence, record.data)
             self._table.note(channel, record.data)
-            self._messages[record.topic] += 1
         self._writer.end_chunk()
         self._sink.append(self._writer.take())
         self._chunk_count += 1
@@ -300,7 +298,7 @@ class Segment:
         if sealed is None:
             os.replace(self._part, self._finished)
             sync_folder(self._part.parent)
-            sealed = self._sink.seal(self._messages)
+            sealed = self._sink.seal(self._writer.digest)
         self._sink.close()
         return sealed
 
@@ -308,12 +306,12 @@ class Segment:
         """The finished segment when it is now the copy with large chunks; None when the disk has no space for it, or
         gives back other bytes than it took: the file stays as it was committed."""
         try:
-            copy = merge_chunks(self._part, self._finished, self._form.compression)
+            sealed = merge_chunks(self._part, self._finished, self._form.compression)
         except DAMAGE:
             return None
         with suppress(OSError):  # the finished one counts where both are
             self._part.unlink()
-        return replace(copy, messages=dict(self._messages))
+        return sealed
 
     def abandon(self) -> None:
         """Let go after an error: what was committed stays as `.part`; a file without a message is removed. OSError
@@ -343,8 +341,8 @@ def _compute_affordable_bytes(folder: Path, form: SeriesSpec) -> int:
 
 
 def merge_chunks(source: Path, target: Path, compression: CompressionType) -> Sealed:
-    """Copy the complete segment `source` to `target`, durably, with large chunks: a reader pays for every chunk. The
-    copy, its messages not counted.
+    """Copy the complete segment `source` to `target`, durably, with large chunks: a reader pays for every chunk.
+    Returns what the copy is.
 
     Telemetry is committed each second, so ten minutes are 600 chunks of a few messages each. The copy has the same
     header, attachments, metadata, schemas, channels and messages in the same order, and the same input gives the same
@@ -357,7 +355,7 @@ def merge_chunks(source: Path, target: Path, compression: CompressionType) -> Se
     temporary = target.with_name(target.name.removesuffix(FINISHED) + TEMPORARY)
     sink = CommitSink(temporary)
     try:
-        _copy(source, sink, compression)
+        digest = _copy(source, sink, compression)
         sink.settle()
         os.replace(temporary, target)
     except BaseException:
@@ -367,10 +365,10 @@ def merge_chunks(source: Path, target: Path, compression: CompressionType) -> Se
     finally:
         sink.close()
     sync_folder(target.parent)
-    return sink.seal({})
+    return sink.seal(digest)
 
 
-def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:
+def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> ContentDigest:
     writer = McapWriter(compression, CHUNK_BYTES)
     size_bytes = source.stat().st_size
     with source.open("rb") as file:
@@ -386,6 +384,7 @@ def _copy(source: Path, sink: CommitSink, compression: CompressionType) -> None:
                 sink.append(parts)
     writer.finish()
     sink.append(writer.take())
+    return writer.digest
 
 
 def _add(writer: McapWriter, opcode: int, content: memoryview) -> None:

@@ -16,6 +16,7 @@ from thermostand.foundation.instants import format_utc
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.recording.exporting.export import export
+from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.tables import GROUP_ROWS, Column, ParquetTable
 from thermostand.recording.format.layout import FRAMES
 from thermostand.recording.reading.notes import add_note, add_tags
@@ -205,7 +206,11 @@ async def test_steps_events_metadata_and_attachments_are_exported(tmp_path):
     assert [(int(row["time_ns"]), row["level"], row["kind"], row["text"]) for row in events] == [
         (event.time_ns, event.level, event.kind, event.text) for event in session.events()
     ]
-    assert json.loads((out / "session.json").read_text(encoding="utf-8")) == INFO.metadata()
+    assert json.loads((out / "session.json").read_text(encoding="utf-8")) == {
+        **INFO.metadata(),
+        **describe_state(session)._asdict(),
+        "findings": list(describe_state(session).findings),
+    }
     for name, text in ATTACHMENTS.items():
         assert (out / "attachments" / name).read_bytes() == text.encode()
 
@@ -293,6 +298,7 @@ PARQUET_WITHOUT_PYARROW = """
 import sys
 sys.modules["pyarrow"] = None  # as an interpreter that has none
 from pathlib import Path
+from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.export import export
 from thermostand.recording.reading.session import Session
 export(Session.open(Path(sys.argv[1])), Path(sys.argv[2]), telemetry="parquet", report=print)

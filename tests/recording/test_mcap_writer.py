@@ -7,6 +7,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
+from thermostand.recording.format.mcap_contents import LIBRARY
 from thermostand.recording.writing.mcap_writer import McapWriter
 
 CHUNK_BYTES = 1000
@@ -25,7 +26,7 @@ MESSAGES = [
 def by_mcap(compression, messages):
     stream = io.BytesIO()
     writer = Writer(stream, CHUNK_BYTES, compression)
-    writer.start()
+    writer.start(library=LIBRARY)
     writer.add_attachment(5, 6, "config.yaml", "application/yaml", b"a: 1")
     writer.add_metadata("session", {"id": "x", "host": "y"})
     for number in (1, 2):
@@ -73,5 +74,6 @@ def test_a_file_is_that_of_mcaps_own_writer(compression, messages):
 def test_a_message_is_handed_over_as_the_object_it_is():
     writer = McapWriter(CompressionType.NONE, CHUNK_BYTES)
     data = bytes(5000)
+    writer.add_channel("/topic", "protobuf", 0, {})
     writer.add_message(1, 1, 1, 1, data)
     assert any(part is data for part in writer.take())

@@ -59,7 +59,7 @@ async def test_every_message_is_given_once_in_order_of_time(tmp_path, encoding):
     assert [time_ns for _, time_ns, _, _ in of_frames] == session.frame_times_ns.tolist()
     assert summary.statistics.message_count == len(messages)
     assert metadata["session"] == session.metadata
-    assert attachments.keys() == {*ATTACHMENTS, "notes.jsonl"}
+    assert attachments.keys() == {*ATTACHMENTS, "notes.jsonl", "session.json"}
     assert list(tmp_path.glob("*.part")) == []
 
 

@@ -268,7 +268,7 @@ def named(found):
 def flip_library(path):
     """The name of the writer's library in the header, which nothing reads."""
     data = path.read_bytes()
-    path.write_bytes(data.replace(b"mcap-python", b"mcap-pythoN", 1))
+    path.write_bytes(data.replace(b"thermostand", b"thermostanD", 1))
 
 
 @pytest.mark.parametrize(("change", "files", "where", "is_listed"), CASES.values(), ids=CASES)

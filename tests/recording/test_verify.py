@@ -12,6 +12,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading
 from thermostand.recording.format.inventory import list_segments
+from thermostand.recording.format.mcap_contents import LIBRARY
 from thermostand.recording.format.records import list_frame_places
 from thermostand.recording.reading.gaps import find_silences
 from thermostand.recording.reading.scan import Severity, verify
@@ -114,8 +115,8 @@ async def test_every_byte_is_guarded_but_the_name_of_the_writers_library(tmp_pat
         path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
         if not errors(directory):
             unguarded.append(place)
-    begin = data.index(b"mcap-python/")
-    assert set(unguarded) <= set(range(begin, begin + len("mcap-python/1.6.0 ")))
+    begin = data.index(LIBRARY.encode())
+    assert set(unguarded) <= set(range(begin, begin + len(LIBRARY)))
 
 
 def tear(path, chunk):

@@ -26,6 +26,7 @@ from thermostand.recording.format.journal_lines import format_lines, parse_lines
 from thermostand.recording.format.layout import FRAME_TABLE, FRAMES, TELEMETRY
 from thermostand.recording.format.manifest import MANIFEST_NAME
 from thermostand.recording.format.mcap_bytes import CHUNK, LENGTH, RECORD
+from thermostand.recording.format.mcap_contents import LIBRARY
 from thermostand.recording.writing.manifest_file import write_manifest
 
 SOUND, INCOMPLETE, DAMAGED, UNKNOWN, NONE = "sound", "incomplete", "damaged", "unknown", ""
@@ -155,7 +156,7 @@ def rewrite(
     new = path.with_suffix(".new")
     with new.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start()
+        writer.start(library=LIBRARY)
         for one in known:
             data = one.data if attachments is None else attachments.get(one.name, one.data)
             writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, data)

@@ -24,7 +24,9 @@ from thermostand.foundation.progress import Report, progress, show_late_progress
 from thermostand.foundation.usage import escape_line
 from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.mcap_export import export_mcap
+from thermostand.recording.exporting.mcap_import import import_mcap
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
+from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format.damage import FileDamaged
 from thermostand.recording.format.inventory import SegmentState, list_segments
@@ -48,7 +50,7 @@ from thermostand.stand.commands.sessions.session_text import (
 
 app = App(
     no_args_is_help=True,
-    help="Recorded sessions: list, look at, verify, repair, replay, export, trim.\n\n"
+    help="Recorded sessions: list, look at, verify, repair, replay, export, import, trim.\n\n"
     "Example: stand session info sessions/20260101T180000Z-thermal-cycle",
 )
 
@@ -238,11 +240,32 @@ def export_session(
     with _open_session(directory, incomplete) as session, show_late_progress("export", 1.0) as report:
         if table_format == "mcap":
             export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
-            show({"out": out}, [out])
-            return
-        tables = table_format if telemetry else None
-        export(session, out, frames=frames, telemetry=tables, report=report)
-    show({"out": out}, [out])
+        else:
+            tables = table_format if telemetry else None
+            export(session, out, frames=frames, telemetry=tables, report=report)
+        state = describe_state(session)
+    for line in state.findings:
+        say(escape_line(line))
+    show({"out": out, **state._asdict()}, [out])
+
+
+@app.command("import")
+def import_session(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An MCAP file that an export has written.")],
+    out: OutOption,
+) -> None:
+    """A session of one MCAP file, as `stand session export --format mcap` writes it; also when another program has
+    rewritten it.
+
+    Example: stand session import session.mcap --out sessions/20260101T180000Z-thermal-cycle
+    """
+    if not file.is_file():
+        raise ConfigError(f"{file}: {'is no file' if file.exists() else 'no such file'}")
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; choose another name or move it away")
+    with show_late_progress("import", 1.0) as report:
+        import_mcap(file, out, report)
+    show({"session": out}, [out])
 
 
 @app.command("trim")

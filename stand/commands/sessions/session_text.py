@@ -16,7 +16,7 @@ from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.catalogue import ListedSession, make_entry
 from thermostand.recording.reading.overview import ChannelRange, FramesSummary, Overview, RunStep
 from thermostand.recording.reading.run_status import Files
-from thermostand.recording.reading.scan import Scan
+from thermostand.recording.reading.scan import Scan, summarise_findings
 from thermostand.stand.commands.sessions.session_table import format_size, make_entry_json
 
 WIDTH = 100
@@ -232,7 +232,7 @@ def make_info_json(found: Overview) -> dict[str, object]:
 
 def format_verification(found: Scan) -> Iterator[str]:
     """`stand session verify`: the findings, then what was read."""
-    yield from map(escape_line, map(str, found.findings))
+    yield from map(escape_line, summarise_findings(found.findings))
     errors = sum(finding.severity == "error" for finding in found.findings)
     count = f" ({errors} {'error' if errors == 1 else 'errors'})" if errors else ""
     yield (
