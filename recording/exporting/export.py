@@ -1,6 +1,7 @@
 """A session as files that any program opens: PNG, text, CSV or Parquet.
 
     OUT/README.txt                   what is where, and how cells are to be read
+    OUT/ro-crate-metadata.json       the same for repositories of research data (ro_crate.py)
     OUT/session.json                 the metadata, and in which state the files of the session were
     OUT/attachments/config.yaml ...  the attached files
     OUT/steps.csv, OUT/events.csv    and OUT/notes.csv, the notes that people wrote
@@ -26,6 +27,7 @@ from pathlib import Path
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import create_folder
+from thermostand.recording.exporting.ro_crate import write_crate
 from thermostand.recording.exporting.sidecar import SIDECAR_COLUMNS, StandTemperatures, format_sidecar, list_frame_facts
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.tables import TABLES, Cell, Column, CsvTable, TableFormat, check_format
@@ -45,6 +47,7 @@ NOTE_COLUMNS = (Column("time_ns", "ns"), *(Column(name, "text") for name in ("by
 
 README = """What is here was exported from a recorded session of a thermal test stand by `stand session export`.
 
+ro-crate-metadata.json    what is here, for repositories of research data (RO-Crate 1.1)
 session.json              what the session is: recipe, camera, operator, version; and the state of its files
 attachments/              configuration, recipe and target, as they were recorded
 steps.csv, events.csv     what was done, and what happened
@@ -118,6 +121,7 @@ def export(
         if session.frame_count:
             _write_frames_table(session, folder, frames, telemetry or "csv")
         _write_originals(session, folder / "originals")
+        write_crate(session, out, folder)
 
 
 class _ExportProgress:

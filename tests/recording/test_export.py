@@ -194,6 +194,7 @@ async def test_steps_events_metadata_and_attachments_are_exported(tmp_path):
         "attachments",
         "events.csv",
         "frames.csv",
+        "ro-crate-metadata.json",
         "session.json",
         "steps.csv",
     ]

@@ -25,6 +25,7 @@ from thermostand.foundation.usage import escape_line
 from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.mcap_export import export_mcap
 from thermostand.recording.exporting.mcap_import import import_mcap
+from thermostand.recording.exporting.nexus import export_nexus
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.trim import trim
@@ -225,14 +226,14 @@ def export_session(
     directory: SessionArgument,
     out: OutOption,
     table_format: Annotated[
-        Literal["csv", "parquet", "mcap"],
-        typer.Option("--format", help="Of the tables; mcap: all of it in one file for viewers, OUT."),
+        Literal["csv", "parquet", "mcap", "nexus"],
+        typer.Option("--format", help="Of the tables; mcap, nexus: all of it in one file, OUT."),
     ] = "csv",
     frames: Annotated[bool, typer.Option("--frames/--no-frames", help="Images with their temperatures.")] = True,
     telemetry: Annotated[bool, typer.Option("--telemetry/--no-telemetry", help="Tables of every topic.")] = True,
     incomplete: IncompleteOption = False,
 ) -> None:
-    """A session as PNG files with their temperatures, and its telemetry as tables; or as one MCAP file.
+    """A session as PNG files with their temperatures, and its telemetry as tables; or as one MCAP or NeXus (HDF5) file.
 
     Example: stand session export sessions/20260101T180000Z-thermal-cycle --out data --format parquet
     """
@@ -240,6 +241,8 @@ def export_session(
     with _open_session(directory, incomplete) as session, show_late_progress("export", 1.0) as report:
         if table_format == "mcap":
             export_mcap(session, out, frames=frames, telemetry=telemetry, report=report)
+        elif table_format == "nexus":
+            export_nexus(session, out, frames=frames, telemetry=telemetry, report=report)
         else:
             tables = table_format if telemetry else None
             export(session, out, frames=frames, telemetry=tables, report=report)
