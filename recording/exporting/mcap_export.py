@@ -14,7 +14,6 @@ from mcap_protobuf.schema import register_schema
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import make_durable_folder, sync_folder
-from thermostand.recording.exporting.ro_crate import write_crate
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.topics import iterate_recorded_messages, list_topics
 from thermostand.recording.format.images import name_frame_topics
@@ -61,7 +60,6 @@ def export_mcap(
             file.flush()
             os.fsync(file.fileno())
         part.rename(out)
-        write_crate(session, out)
         sync_folder(out.parent)
     except OSError as error:
         raise SessionError(f"{out}: cannot be written ({error})") from error

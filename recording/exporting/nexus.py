@@ -30,7 +30,6 @@ from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.extras import import_extra
 from thermostand.foundation.files import make_durable_folder, sync_folder
-from thermostand.recording.exporting.ro_crate import write_crate
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.format.decoded_items import decode_frame
 from thermostand.recording.format.messages import FrameMeta
@@ -66,7 +65,6 @@ def export_nexus(
         with part.open("rb") as written:
             os.fsync(written.fileno())
         part.rename(out)
-        write_crate(session, out)
         sync_folder(out.parent)
     except OSError as error:
         raise SessionError(f"{out}: cannot be written ({error})") from error

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from thermostand.foundation.files import write_atomically
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.reading.session import Session
 
@@ -31,11 +32,11 @@ _NO_LICENSE = "No licence is stated by those who recorded these data; ask them b
 
 def write_crate(session: Session, out: Path, folder: Path | None = None) -> None:
     """Write the crate of an export: into `folder`, which becomes the folder `out`, or for one file `out` next to it, as
-    `NAME-ro-crate-metadata.json`. Raises OSError."""
+    `NAME-ro-crate-metadata.json`. SessionError when the disk refuses."""
     parts = [out] if folder is None else sorted(path for path in folder.iterdir() if path.name != CRATE_NAME)
     place = out.with_name(f"{out.name}-{CRATE_NAME}") if folder is None else folder / CRATE_NAME
     graph = {"@context": _CONTEXT, "@graph": list(_iterate_entities(session, parts))}
-    place.write_text(json.dumps(graph, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_atomically(place, json.dumps(graph, indent=1, ensure_ascii=False) + "\n")
 
 
 def _iterate_entities(session: Session, parts: Sequence[Path]) -> Iterator[dict[str, object]]:

@@ -22,7 +22,7 @@ from thermostand.recording.exporting import nexus
 from thermostand.recording.exporting.export import export
 from thermostand.recording.exporting.mcap_export import export_mcap
 from thermostand.recording.exporting.nexus import export_nexus
-from thermostand.recording.exporting.ro_crate import CRATE_NAME
+from thermostand.recording.exporting.ro_crate import CRATE_NAME, write_crate
 from thermostand.recording.reading.notes import add_note
 from thermostand.recording.reading.session import Session
 
@@ -162,6 +162,8 @@ def test_the_crate_of_each_export_is_read_by_rocrate(exported, tmp_path):
     session, path = exported
     export(session, tmp_path / "tables", report=ignore)
     export_mcap(session, tmp_path / "night.mcap", report=ignore)
+    for each in (path, tmp_path / "night.mcap"):
+        write_crate(session, each)
     crates = {
         "tables": load(tmp_path / "tables" / CRATE_NAME, tmp_path / "tables"),
         "nexus": load(tmp_path / f"night.nxs-{CRATE_NAME}", tmp_path / "of-nexus"),

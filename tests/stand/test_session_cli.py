@@ -278,6 +278,7 @@ def test_export_writes_images_and_tables(session: Path, tmp_path: Path):
         "attachments",
         "events.csv",
         "frames.csv",
+        "ro-crate-metadata.json",
         "session.json",
         "steps.csv",
     ]
@@ -287,6 +288,12 @@ def test_export_writes_one_file_for_a_viewer(session: Path, tmp_path: Path):
     out = tmp_path / "cycle.mcap"
     assert ask("export", session, "--out", out, "--format", "mcap").stdout == f"{out}\n"
     assert out.read_bytes()[:5] == b"\x89MCAP"
+    assert (tmp_path / f"{out.name}-ro-crate-metadata.json").is_file()
+    assert ask("import", out, "--out", tmp_path / "again").stdout == f"{tmp_path / 'again'}\n"
+    assert "files sound" in ask("verify", session).stdout
+    assert "12 frames" in ask("verify", tmp_path / "again").stdout
+    assert "no such file" in read_refusal("import", tmp_path / "x.mcap", "--out", tmp_path / "y")
+    assert "exists already" in read_refusal("import", out, "--out", tmp_path / "again")
     assert "exists already" in read_refusal("export", session, "--out", out, "--format", "mcap")
 
 

@@ -27,6 +27,7 @@ from thermostand.recording.exporting.mcap_export import export_mcap
 from thermostand.recording.exporting.mcap_import import import_mcap
 from thermostand.recording.exporting.nexus import export_nexus
 from thermostand.recording.exporting.replay import ReplayClock, replay, replay_and_record
+from thermostand.recording.exporting.ro_crate import write_crate
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format.damage import FileDamaged
@@ -246,6 +247,8 @@ def export_session(
         else:
             tables = table_format if telemetry else None
             export(session, out, frames=frames, telemetry=tables, report=report)
+        if table_format in ("mcap", "nexus"):
+            write_crate(session, out)
         state = describe_state(session)
     for line in state.findings:
         say(escape_line(line))
