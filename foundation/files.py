@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
@@ -190,10 +191,39 @@ def _sync_all(folder: Path) -> None:
     sync_folder(folder)
 
 
+_CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # of CIFS, some FUSE file systems and exchange disks
+_accepting: list[Callable[[str], None]] = []
+
+
+@contextmanager
+def accept_unsynced_folders(say: Callable[[str], None]) -> Generator[None]:
+    """While inside, a file system that cannot sync folders is no error: `say` gets one sentence about it. For commands
+    that somebody runs on an exchange disk, and can run again; what must be durable stays strict."""
+    said: set[str] = set()
+
+    def say_once(text: str) -> None:
+        if not said:
+            said.add(text)
+            say(text)
+
+    _accepting.append(say_once)
+    try:
+        yield
+    finally:
+        _accepting.remove(say_once)
+
+
 def sync_folder(folder: Path) -> None:
-    """Make the folder's names durable."""
+    """Make the folder's names durable; OSError when the disk refuses, and where its file system cannot do that."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
+    except OSError as error:
+        if error.errno not in _CANNOT_SYNC:
+            raise
+        cause = f"the file system of {folder} cannot sync folders ({error.strerror})"
+        if not _accepting:
+            raise OSError(error.errno, f"{cause}; record to a disk that can, as ext4 or XFS") from error
+        _accepting[-1](f"{cause}: unmount it before you take it away")
     finally:
         os.close(fd)

@@ -67,16 +67,43 @@ def list_segments(directory: Path) -> tuple[SegmentFile, ...]:
     return tuple(file for series in (TELEMETRY, FRAMES) for file in _list_series(directory / series))
 
 
+def _is_like_segment(name: str) -> bool:
+    """Whether it has an ending of segments, in small letters, capitals or cut short."""
+    return name.lower().endswith(tuple(_STATE)) or _CHANGED_SEGMENT.fullmatch(name) is not None
+
+
 def list_strays(directory: Path) -> tuple[str, ...]:
     """What lies among the segments or next to their folders, is called as if it were one, and is none: a copy
     (`0003 (1).mcap`, `00003.mcap`), what another system leaves (`._0003.mcap`), or no file. It counts for nothing."""
     found: list[str] = []
     for series in ("", TELEMETRY, FRAMES):
         with suppress(OSError):
-            names = [path.name for path in (directory / series).iterdir() if path.name.endswith(tuple(_STATE))]
+            names = [path.name for path in (directory / series).iterdir() if _is_like_segment(path.name)]
             known = {file.path.name for file in _list_series(directory / series)} if series else set[str]()
             found += [f"{series}/{name}".lstrip("/") for name in sorted(set(names) - known)]
     return tuple(found)
+
+
+# What a file system leaves of the names of a session: capitals (TELEMETRY/0003.MCAP), or 8.3 (TELEME~1/0003~1.MCA).
+_CHANGED_FOLDER = re.compile(r"(telemetry|frames|telem\w*~\d+|frame\w*~\d+)", re.IGNORECASE)
+_CHANGED_SEGMENT = re.compile(r"\d{4,}(~\d+)?\.(mca|mcap|mcap\.part|par|mcap\.damaged|dam)", re.IGNORECASE)
+
+
+def explain_changed_names(directory: Path) -> str:
+    """Why no segment is found where a file system has changed their names, as the part of a sentence; "" when it has
+    not."""
+    with suppress(OSError):
+        for folder in sorted(path for path in directory.iterdir() if _CHANGED_FOLDER.fullmatch(path.name)):
+            for path in sorted(folder.iterdir()):
+                if (_CHANGED_SEGMENT.fullmatch(path.name) and _parse_segment_file(path) is None) or (
+                    folder.name not in (TELEMETRY, FRAMES) and _CHANGED_SEGMENT.fullmatch(path.name)
+                ):
+                    return (
+                        f"a file system has changed its names to capitals or 8.3 ({folder.name}/{path.name}); give "
+                        f"them back as {TELEMETRY}/NNNN.mcap and {FRAMES}/NNNN.mcap, or copy the session in a tar or "
+                        "zip archive"
+                    )
+    return ""
 
 
 def _list_series(folder: Path) -> list[SegmentFile]:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import cast
 
 from thermostand.foundation.errors import ConfigError, SessionError
+from thermostand.foundation.files import sync_folder
 from thermostand.foundation.json_values import parse_json_object
 from thermostand.recording.format.journal_lines import (
     format_damage,
@@ -140,7 +141,7 @@ def _append(directory: Path, fields: Mapping[str, object]) -> None:
             os.ftruncate(fd, end)
             _write_whole(fd, format_lines((text,), lines.mark or make_mark(directory.absolute().name), end), end)
             os.fsync(fd)
-            os.fsync(folder)  # the file may be new
+            sync_folder(directory)  # the file may be new
     except OSError as error:
         why = "the folder is a symbolic link" if directory.is_symlink() else error.strerror
         raise SessionError(f"{path}: the note could not be kept ({why})") from error

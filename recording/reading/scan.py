@@ -46,6 +46,7 @@ from thermostand.recording.format.inventory import (
     MOST_MISSING,
     SegmentFile,
     SegmentState,
+    explain_changed_names,
     find_foreign_numbers,
     find_missing_numbers,
     is_misplaced,
@@ -302,7 +303,8 @@ def scan(path: Path, depth: Depth = Depth.ENDS, report: Report = _no_report) -> 
     strangers = find_strangers(path)
     files = tuple(file for file in list_segments(path) if file.name not in strangers)
     if not files:
-        raise SessionError(f"{path}: not a session: there is no segment in its folders {TELEMETRY} and {FRAMES}")
+        why = explain_changed_names(path) or f"there is no segment in its folders {TELEMETRY} and {FRAMES}"
+        raise SessionError(f"{path}: not a session: {why}")
     look = _SessionScanner(path, files, strangers, depth)
     look.read(report)
     found = look.build_result()

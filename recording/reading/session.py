@@ -37,7 +37,7 @@ from thermostand.recording.format.decoded_items import (
     read_recorded_image,
 )
 from thermostand.recording.format.holes import Hole
-from thermostand.recording.format.inventory import SegmentState, is_misplaced, list_segments
+from thermostand.recording.format.inventory import SegmentState, explain_changed_names, is_misplaced, list_segments
 from thermostand.recording.format.layout import (
     FINISHED,
     FRAMES,
@@ -111,7 +111,8 @@ class Session:
             count = sum(file.state in _UNFINISHED for file in files)
             unfinished = f", only {count} unfinished ones" if count else ""
             kind = SessionError if count else NotFound
-            raise kind(f"{path}: not a session: there is no finished segment in {path / TELEMETRY}{unfinished}")
+            why = explain_changed_names(path) or f"there is no finished segment in {path / TELEMETRY}{unfinished}"
+            raise kind(f"{path}: not a session: {why}")
         return cls(path, telemetry, frames)
 
     @property

@@ -10,15 +10,18 @@ that alone.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from filecmp import cmp
 from hashlib import blake2b
 from itertools import chain, count
 from pathlib import Path
+from shutil import copyfile
 from typing import BinaryIO
 
 from mcap.records import Attachment, Channel, Schema
@@ -27,7 +30,7 @@ from mcap.writer import CompressionType
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import sync_folder
 from thermostand.recording.format.images import ZSTD_LEVEL
-from thermostand.recording.format.inventory import SegmentState, list_segments
+from thermostand.recording.format.inventory import SegmentState, explain_changed_names, list_segments
 from thermostand.recording.format.layout import (
     DAMAGED,
     FINISHED,
@@ -206,6 +209,7 @@ def _get_size(path: Path) -> int:
 
 
 BEING_RECORDED = "is being recorded"
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EACCES)
 # Telemetry is small and read often: zstd's usual level. Frames are as the recorder writes them.
 LEVELS = {FRAMES: ZSTD_LEVEL, TELEMETRY: 3}  # of zstd
 
@@ -233,8 +237,9 @@ def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Sa
     """Finish every unfinished segment and every finished one that is damaged. SessionError when there is no session,
     or when the disk refuses: then the segment at hand is as it was and those before it are salvaged."""
     folders = [directory / series for series in (TELEMETRY, FRAMES) if (directory / series).is_dir()]
-    if not folders:
-        raise SessionError(f"{directory}: not a session: it has neither {TELEMETRY} nor {FRAMES}")
+    why = "" if list_segments(directory) else explain_changed_names(directory)
+    if why or not folders:
+        raise SessionError(f"{directory}: not a session: {why or f'it has neither {TELEMETRY} nor {FRAMES}'}")
     return [*_salvage_folders(folders, True, report), *_update_manifest(directory)]
 
 
@@ -564,13 +569,33 @@ def _keep(original: _Original) -> Path:
     number = original.finished.name.removesuffix(FINISHED)
     names = (f"{number}{DAMAGED}" if n == 1 else f"{number}.{n}{DAMAGED}" for n in count(1))
     for path in (original.path.with_name(name) for name in names):
-        if path.exists() and path.samefile(original.path):
+        if path.exists() and (path.samefile(original.path) or cmp(path, original.path, shallow=False)):
             return path
         if not path.exists():
-            os.link(original.path, path)
+            _link_or_copy(original.path, path)
             sync_folder(path.parent)
             return path
     raise ValueError("counting ends")
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    """A second name for a file, or where the file system has none (exFAT, CIFS), a copy on the disk."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        growing = target.with_name(f".{target.name}.copying")
+        try:
+            copyfile(source, growing)
+            with growing.open("rb") as file:
+                os.fsync(file.fileno())
+            growing.rename(target)
+        except OSError as failed:
+            growing.unlink(missing_ok=True)
+            raise OSError(
+                failed.errno, f"its file system has no hard links, and a copy failed: {failed.strerror}"
+            ) from failed
 
 
 def format_salvaged(salvaged: Salvaged) -> str:

@@ -15,6 +15,7 @@ from thermostand.foundation.clock import WallClock
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.exit_codes import FAILED
+from thermostand.foundation.files import accept_unsynced_folders
 from thermostand.foundation.output import get_output, say, show
 from thermostand.foundation.progress import show_late_progress
 from thermostand.foundation.usage import escape_line, print_error
@@ -128,7 +129,8 @@ def _copy(entries: Sequence[ListedSession], out: Path, found: _ArchiveResult, *,
                 report(done, escape_line(name))
 
             try:
-                copy = archive(entry, out, get_user_name(), WallClock().now_ns(), count)
+                with accept_unsynced_folders(lambda text: say(f"warning: {text}")):
+                    copy = archive(entry, out, get_user_name(), WallClock().now_ns(), count)
                 found.copied[entry.name] = copy
                 _print_line(f"{entry.name}: copied to {copy} and read back ({format_size(entry.size_bytes)})")
             except SessionError as error:

@@ -16,6 +16,7 @@ from thermostand.foundation.clock import NS_PER_S, VirtualClock
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.foundation.exit_codes import FAILED
+from thermostand.foundation.files import accept_unsynced_folders
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.instants import parse_instant
 from thermostand.foundation.items import Event, Item, StepMark
@@ -31,7 +32,7 @@ from thermostand.recording.exporting.ro_crate import write_crate
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.trim import trim
 from thermostand.recording.format.damage import FileDamaged
-from thermostand.recording.format.inventory import SegmentState, list_segments
+from thermostand.recording.format.inventory import SegmentState, explain_changed_names, list_segments
 from thermostand.recording.reading.overview import summarise_session
 from thermostand.recording.reading.scan import Scan, scan, verify
 from thermostand.recording.reading.session import Session, check_whole
@@ -73,8 +74,8 @@ def info(directory: SessionArgument) -> None:
 def _find_sessions(directory: Path) -> list[Path]:
     """`directory` itself when it is a session, else those in it; ConfigError when there is no such folder."""
     check_folder(directory)
-    if list_segments(directory):
-        return [directory]
+    if list_segments(directory) or explain_changed_names(directory):
+        return [check_session(directory)]
     return [path for path in sorted(directory.iterdir()) if path.is_dir() and list_segments(path)]
 
 
@@ -91,7 +92,8 @@ def _open_session(directory: Path, incomplete: bool) -> Generator[Session]:
     try:
         session = Session.open(directory)
         check_whole(session, _warn if incomplete else None)
-        yield session
+        with accept_unsynced_folders(_warn):
+            yield session
     except FileDamaged as error:
         raise SessionError(f"{error}; {help_text} recovers what is sound") from error
 
@@ -133,7 +135,7 @@ def repair(
     sizes = {path: sum(file.size_bytes for file in list_segments(path)) for path in _find_sessions(directory)}
     done: list[Salvaged] = []
     done_bytes = 0
-    with show_late_progress("repair", sum(sizes.values())) as report:
+    with accept_unsynced_folders(_warn), show_late_progress("repair", sum(sizes.values())) as report:
         for path, size_bytes in sizes.items():
             for salvaged in salvage_session(path, _make_part_report(report, done_bytes, size_bytes)):
                 done.append(salvaged)
@@ -269,7 +271,7 @@ def import_session(
         raise ConfigError(f"{file}: {'is no file' if file.exists() else 'no such file'}")
     if out.exists():
         raise ConfigError(f"{out}: exists already; choose another name or move it away")
-    with show_late_progress("import", 1.0) as report:
+    with accept_unsynced_folders(_warn), show_late_progress("import", 1.0) as report:
         import_mcap(file, out, report)
     show({"session": out}, [out])
 

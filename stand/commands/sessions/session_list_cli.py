@@ -125,8 +125,10 @@ def tag(
 
 def _save(directory: Path, add: Callable[..., None]) -> None:
     from thermostand.foundation.clock import WallClock
+    from thermostand.foundation.files import accept_unsynced_folders
 
-    add(check_session(directory), by=get_user_name(), time_ns=WallClock().now_ns())
+    with accept_unsynced_folders(lambda text: say(f"warning: {text}")):
+        add(check_session(directory), by=get_user_name(), time_ns=WallClock().now_ns())
     text = read_notes(directory)
     count = f"{len(text.notes)} note{'' if len(text.notes) == 1 else 's'}"
     line = escape_line(f"{directory}: {count}, tags: {', '.join(text.tags) or 'none'}")
