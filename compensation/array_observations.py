@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +20,8 @@ from thermostand.compensation.history.thermal_history import (
     read_history,
     refine_temperature,
 )
-from thermostand.compensation.observations import Float, Observations, SessionFacts
+from thermostand.compensation.observations import Float, Observations, SessionFacts, concatenate
+from thermostand.compensation.spreadsheet import Spreadsheet, read_spreadsheet
 from thermostand.compensation.value_checks import LARGEST_SIDE_px, check_centres, check_degC
 from thermostand.experiments.steps import Role
 from thermostand.foundation.clock import NS_PER_S
@@ -28,42 +29,6 @@ from thermostand.foundation.errors import SessionError
 from thermostand.markers.target import Target
 from thermostand.recording.reading.interpolation import interpolate
 from thermostand.recording.reading.session import Session
-
-Row = Mapping[str, str]
-
-
-def read_rows(path: Path, needed: Sequence[str], why: str) -> tuple[list[dict[str, str]], Sequence[str]]:
-    """The rows, and the names of all columns; SessionError when it is no table, lacks one of the `needed` columns
-    (`why` follows the name of the first), or a row has not as many cells as the first line."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, strict=True)
-            rows = list(reader)
-            columns = reader.fieldnames or ()
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SessionError(f"{path}: cannot be read as a CSV table ({error})") from error
-    if missing := [name for name in needed if name not in columns]:
-        raise SessionError(f"{path}: has no column {missing[0]}; {why}")
-    for line, row in enumerate(rows, 2):
-        if None in row or None in row.values():
-            raise SessionError(f"{path}: line {line} has not as many cells as the first line")
-    return rows, columns
-
-
-def parse_column(path: Path, rows: Sequence[Row], column: str) -> NDArray[np.float64]:
-    """(M,): a column's values, NaN for `nan` and empty cells; SessionError that names the line of anything else."""
-    return np.array([_parse_number(path, line, column, row[column].strip()) for line, row in enumerate(rows, 2)])
-
-
-def _parse_number(path: Path, line: int, column: str, text: str) -> float:
-    try:
-        value = float(text) if text else math.nan
-    except ValueError:
-        raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a number") from None
-    if math.isinf(value):
-        raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a finite number")
-    return value
-
 
 Column = tuple[ArrayLike, ArrayLike]
 """Instants, ns, ascending, and values."""
@@ -181,122 +146,171 @@ def _check_instants(time_ns: ArrayLike, camera_degC: ArrayLike | None) -> tuple[
 
 
 NEEDED = ("frame", "marker", "x_px", "y_px", "camera_degC")
-OF_FRAMES = ("camera_degC", "time_ns", "chamber_degC", "role", "air_degC")
-_COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+SIZE = ("width_px", "height_px")
+CENTRE_COLUMNS = (
+    "session", "frame", "image", "time_ns", "role", "chamber_degC", "camera_degC", "air_degC", *SIZE,
+    "marker", "x_px", "y_px", *COVARIANCE,
+)  # fmt: skip
+"""Of the table of centres that `compensate observe` writes; those that `load_observations` does not need may lack."""
+_OF_FRAMES = ("session", "role", "chamber_degC", "camera_degC", "air_degC", "time_ns")
 _ROW_EACH = f"it needs {', '.join(NEEDED)}, a row for each centre"
-_MOST_FRAMES, _MOST_MARKERS = 1_000_000, 100_000
+_MOST_FRAMES, _MOST_MARKERS, _LAST_NS = 1_000_000, 100_000, 2**63 - 1
 Index = NDArray[np.int64]
 
 
 def load_observations(path: Path, camera_serial: str = "") -> Observations:
-    """A row for each centre: frame and marker (whole numbers from 0 on, in any order), x_px, y_px and camera_degC; and,
-    where they are known, time_ns, chamber_degC (the set-point), role, air_degC (of the air near the camera, for the
-    thermal form), var_x_px2, cov_xy_px2 and var_y_px2.
+    """Load a table of centres, as any spreadsheet program writes it.
+
+    It has a row for each centre: frame and marker (whole numbers from 0 on, in any order), x_px, y_px and camera_degC;
+    and, where they are known, time_ns, chamber_degC (the set-point), role, air_degC (of the air near the camera, for
+    the thermal form), var_x_px2, cov_xy_px2 and var_y_px2, width_px and height_px of the image, and session: between
+    two sessions target or camera were moved, and each has its own reference. A row without a marker is a reading
+    between the frames, of time_ns with air_degC or camera_degC.
 
     A marker without a row, or with an empty place, is missing. SessionError that names file, line and column.
     """
-    rows = _read_centre_rows(path)
-    frame, frame_at = _index_numbers(path, rows, "frame", _MOST_FRAMES)
-    marker, marker_at = _index_numbers(path, rows, "marker", _MOST_MARKERS)
-    pairs, first = np.unique(np.column_stack([frame_at, marker_at]), axis=0, return_index=True)
-    if len(pairs) < len(rows):
-        line = int(np.setdiff1d(np.arange(len(rows)), first)[0])
-        raise SessionError(f"{path}: line {line + 2}: frame {rows[line]['frame']} has this marker already")
-    shape = (len(frame), int(marker.max()) + 1)
-    centres, covariance = np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
-    at = frame_at, marker[marker_at]
-    centres[at] = np.column_stack([parse_column(path, rows, "x_px"), parse_column(path, rows, "y_px")])
-    of_frames = {name: _collect_frame_texts(path, rows, frame_at, name) for name in OF_FRAMES if name in rows[0]}
-    times = of_frames.get("time_ns")
-    time_ns = None if times is None else np.array([_parse_instant(path, text) for text in times], np.int64)
-    if time_ns is not None and (np.diff(time_ns) <= 0).any():
-        raise SessionError(f"{path}: time_ns does not grow from frame to frame; number the frames in order of time")
-    air = _parse_temperatures(path, of_frames, "air_degC")
-    if air is not None and time_ns is None:
-        raise SessionError(f"{path}: has air_degC without time_ns; the thermal form needs both")
-    camera_degC = _parse_temperatures(path, of_frames, "camera_degC")
-    if _COVARIANCE[0] in rows[0]:
-        covariance[at] = _parse_covariances(path, rows)
-    try:
-        return observations_of(
-            centres,
-            np.empty(0) if camera_degC is None else camera_degC,
-            time_ns,
-            chamber_degC=_parse_temperatures(path, of_frames, "chamber_degC"),
-            role=_check_roles(path, of_frames.get("role")),
-            air=None if air is None or time_ns is None else (time_ns, air),
-            covariance_px2=covariance if _COVARIANCE[0] in rows[0] else None,
-            camera_serial=camera_serial,
-            name=path.stem,
-        )
-    except ValueError as error:
-        raise SessionError(f"{path}: {error}") from error
-
-
-def _read_centre_rows(path: Path) -> list[dict[str, str]]:
-    rows, columns = read_rows(path, NEEDED, _ROW_EACH)
-    missing = [name for name in _COVARIANCE if name not in columns]
-    if missing and len(missing) < len(_COVARIANCE):
+    table = read_spreadsheet(path)
+    table.require(NEEDED, _ROW_EACH)
+    missing = [name for name in COVARIANCE if not table.has(name)]
+    if missing and len(missing) < len(COVARIANCE):
         raise SessionError(f"{path}: has no column {missing[0]}; {_ROW_EACH}")
-    if not rows:
+    of_marker = np.array([bool(text) for text in table.column("marker")], bool)
+    seen, readings = table.select(of_marker), table.select(~of_marker)
+    if not seen.lines:
         raise SessionError(f"{path}: has no rows; it needs one for each centre")
-    return rows
+    frame, frame_at = np.unique(seen.whole_numbers("frame", _MOST_FRAMES), return_inverse=True)
+    marker = seen.whole_numbers("marker", _MOST_MARKERS)
+    pairs, first = np.unique(np.column_stack([frame_at, marker]), axis=0, return_index=True)
+    if len(pairs) < len(marker):
+        row = int(np.setdiff1d(np.arange(len(marker)), first)[0])
+        raise seen.fault(row, f"frame {frame[frame_at[row]]} has this marker already")
+    centres = np.full((len(frame), int(marker.max()) + 1, 2), np.nan)
+    covariance = np.full((*centres.shape, 2), np.nan)
+    centres[frame_at, marker] = np.column_stack([seen.numbers("x_px"), seen.numbers("y_px")])
+    if not missing:
+        covariance[frame_at, marker] = _parse_covariances(seen)
+    frames = _take_first_rows(seen, frame_at)
+    size = _parse_size(seen)
+    if size is None and np.isfinite(centres).any():
+        size = _estimate_image_size(centres)
+    sessions = frames.column("session") if frames.has("session") else [""] * len(frame)
+    parts: list[Observations] = []
+    for name in dict.fromkeys(sessions):
+        own = np.array([each == name for each in sessions], bool)
+        given = _FrameColumns.of(frames.select(own), readings.select(_is_of(readings, name)))
+        try:
+            parts.append(
+                observations_of(
+                    centres[own],
+                    given.camera_degC,
+                    given.time_ns,
+                    chamber_degC=given.chamber_degC,
+                    role=given.role,
+                    air=given.air,
+                    camera=given.camera,
+                    covariance_px2=None if missing else covariance[own],
+                    image_size=size,
+                    camera_serial=camera_serial,
+                    name=f"{path.stem} {name}".strip(),
+                )
+            )
+        except ValueError as error:
+            raise SessionError(f"{path}: {error}") from error
+    return concatenate(parts)
 
 
-def _index_numbers(path: Path, rows: Sequence[Row], column: str, most: int) -> tuple[Index, Index]:
-    """The numbers that occur, ascending, and each row's index among them."""
-    for line, row in enumerate(rows, 2):
-        text = row[column].strip()
-        if not text.isdecimal() or int(text) >= most:
-            raise SessionError(f"{path}: line {line}: {column} is {text!r}, not a whole number from 0 on below {most}")
-    found, at = np.unique(np.array([int(row[column]) for row in rows], np.int64), return_inverse=True)
-    return found, at.ravel().astype(np.int64)
+@dataclass(frozen=True, slots=True, eq=False)
+class _FrameColumns:
+    """What a table says of the frames of one session; None for a column that it has not."""
+
+    camera_degC: Float
+    time_ns: Index | None
+    chamber_degC: Float | None
+    role: list[str] | None
+    air: Column | None
+    camera: Column | None
+
+    @classmethod
+    def of(cls, frames: Spreadsheet, readings: Spreadsheet) -> _FrameColumns:
+        """SessionError that names what does not fit."""
+        path, time_ns = frames.path, None
+        if frames.states("time_ns"):
+            time_ns = frames.whole_numbers("time_ns", _LAST_NS)
+            if (np.diff(time_ns) <= 0).any():
+                raise SessionError(
+                    f"{path}: time_ns does not grow from frame to frame; number the frames in order of time"
+                )
+        if frames.states("air_degC") and time_ns is None:
+            raise SessionError(f"{path}: has air_degC without time_ns; the thermal form needs both")
+        air, camera = (_merge_readings(frames, readings, time_ns, name) for name in ("air_degC", "camera_degC"))
+        return cls(
+            camera_degC=frames.numbers("camera_degC"),
+            time_ns=time_ns,
+            chamber_degC=frames.numbers("chamber_degC") if frames.states("chamber_degC") else None,
+            role=_check_roles(frames) if frames.states("role") else None,
+            air=air,
+            camera=camera if air is not None and readings.lines else None,
+        )
 
 
-def _parse_covariances(path: Path, rows: Sequence[Row]) -> Float:
+def _merge_readings(frames: Spreadsheet, readings: Spreadsheet, time_ns: Index | None, name: str) -> Column | None:
+    """The instants, ascending, and values of a column, in the frames and between them; None where it is not known."""
+    if time_ns is None or not frames.states(name):
+        return None
+    instants = np.concatenate([time_ns, readings.whole_numbers("time_ns", _LAST_NS)])
+    values = np.concatenate([frames.numbers(name), readings.numbers(name)])
+    order = np.argsort(instants, kind="stable")
+    known = order[np.isfinite(values[order])]
+    return (instants[known], values[known]) if len(known) else None
+
+
+def _is_of(readings: Spreadsheet, session: str) -> NDArray[np.bool_]:
+    """(M,): readings of this session, and those of all."""
+    if not readings.has("session"):
+        return np.ones(len(readings.lines), bool)
+    return np.array([text in ("", session) for text in readings.column("session")], bool)
+
+
+def _take_first_rows(table: Spreadsheet, frame_at: NDArray[np.intp]) -> Spreadsheet:
+    """The first row of each frame, in the order of their numbers; SessionError when a later row contradicts it."""
+    _, first = np.unique(frame_at, return_index=True)
+    for name in (name for name in _OF_FRAMES if table.has(name)):
+        cells = table.column(name)
+        for row, at in enumerate(frame_at.tolist()):
+            if cells[row] != cells[first[at]]:
+                frame = table.column("frame")[row]
+                raise table.fault(row, f"{name} of frame {frame} is another one in an earlier line")
+    return table.take(first)
+
+
+def _parse_size(table: Spreadsheet) -> tuple[int, int] | None:
+    """The image's width and height, px; None where the table does not say them."""
+    if not all(table.has(name) for name in SIZE):
+        return None
+    found = np.unique(np.column_stack([table.whole_numbers(name, LARGEST_SIDE_px + 1) for name in SIZE]), axis=0)
+    if len(found) > 1:
+        raise SessionError(f"{table.path}: {' and '.join(SIZE)} are not the same in all rows; one camera has one size")
+    return int(found[0, 0]), int(found[0, 1])
+
+
+def _parse_covariances(table: Spreadsheet) -> Float:
     """(M, 2, 2); SessionError where it is none."""
-    xx, xy, yy = (parse_column(path, rows, name) for name in _COVARIANCE)
-    placed = np.array([bool(row["x_px"].strip()) for row in rows])
+    xx, xy, yy = (table.numbers(name) for name in COVARIANCE)
+    placed = np.isfinite(table.numbers("x_px"))
     wrong = placed & ~((xx > 0) & (yy > 0) & (xx * yy > xy**2))
     if wrong.any():
-        line = int(np.flatnonzero(wrong)[0]) + 2
-        raise SessionError(f"{path}: line {line}: {', '.join(_COVARIANCE)} are no covariance of a centre")
+        raise table.fault(int(np.flatnonzero(wrong)[0]), f"{', '.join(COVARIANCE)} are no covariance of a centre")
     return np.stack([np.stack([xx, xy], axis=1), np.stack([xy, yy], axis=1)], axis=1)
 
 
-def _collect_frame_texts(path: Path, rows: Sequence[Row], frame_at: Index, column: str) -> list[str]:
-    """The text of each frame, which is the same in all of its rows."""
-    found: dict[int, str] = {}
-    for line, (index, row) in enumerate(zip(frame_at.tolist(), rows, strict=True), 2):
-        if found.setdefault(index, row[column].strip()) != row[column].strip():
-            raise SessionError(
-                f"{path}: line {line}: {column} of frame {row['frame']} is another one in an earlier line"
-            )
-    return [found[index] for index in range(len(found))]
-
-
-def _parse_temperatures(path: Path, of_frames: Mapping[str, list[str]], column: str) -> Float | None:
-    texts = of_frames.get(column)
-    if texts is None:
-        return None
-    try:
-        return np.array([float(text) if text else math.nan for text in texts])
-    except ValueError as error:
-        raise SessionError(f"{path}: {column}: {error}") from None
-
-
-def _parse_instant(path: Path, text: str) -> int:
-    if not text.isdecimal():
-        raise SessionError(f"{path}: time_ns is {text!r}, not a whole number of nanoseconds")
-    return int(text)
-
-
-def _check_roles(path: Path, texts: list[str] | None) -> list[str] | None:
+def _check_roles(table: Spreadsheet) -> list[str]:
     known = [str(role) for role in Role]
-    for text in texts or []:
+    roles = [text.casefold() for text in table.column("role")]
+    for row, text in enumerate(roles):
         if text not in known:
-            raise SessionError(f"{path}: role is {text!r}, not one of {', '.join(known)}")
-    return texts
+            raise table.fault(row, f"role is {table.column('role')[row]!r}, not one of {', '.join(known)}")
+    return roles
 
 
 _SPACING_mm = 1.0
@@ -385,7 +399,29 @@ def observations_of(
         flags=np.zeros((frames, count), np.uint8),
         reasons=tuple(map(_explain_unusable, own.tolist(), np.all(missing, axis=1).tolist())),
         histories=() if history is None else (history,),
+        not_known=_list_unknown(
+            {
+                "times": time_ns is None,
+                "air": history is None,
+                "supply": history is not None and supply is None,
+                "set_points": chamber_degC is None,
+                "uncertainty": covariance_px2 is None,
+            },
+            sigma_px,
+        ),
     )
+
+
+def _list_unknown(is_unknown: Mapping[str, bool], sigma_px: float) -> dict[str, str]:
+    """What follows from each thing that is not known."""
+    meaning = {
+        "times": "times: drift with time, as while switching on, cannot be separated from drift with temperature",
+        "air": "the air near the camera, and its history: the thermal form, which has lags, cannot be fitted",
+        "supply": "when the camera was off: it is taken to have been on all the time",
+        "set_points": "set-points: the camera's temperature in whole degrees stands for them",
+        "uncertainty": f"uncertainty of the centres: {sigma_px:g} px is taken for each coordinate",
+    }
+    return {name: text for name, text in meaning.items() if is_unknown[name]}
 
 
 def _check_covariance(covariance_px2: ArrayLike | None, sigma_px: float, missing: NDArray[np.bool_]) -> Float:

@@ -16,6 +16,10 @@ app = make_lazy_app(
         "detect": LazyCommand(
             "thermostand.compensation.commands.detect_cli", "Find the target's markers: a table of centres."
         ),
+        "observe": LazyCommand(
+            "thermostand.compensation.commands.observe_cli",
+            "Pictures and tables of other laboratories: a table of centres to fit.",
+        ),
         "fit": LazyCommand(_FIT, "Fit the drift model to the frames of sessions of one camera."),
         "report": LazyCommand(_FIT, "Write the report of sessions of one camera: drift, model, and what it gains."),
         "datasheet": LazyCommand(

@@ -127,7 +127,8 @@ class Observations:
     the camera. Temperatures are NaN when unknown. centres_px (F, N, 2), covariance_px2 (F, N, 2, 2): NaN when the
     marker is missing or flagged. flags (F, N): of markers.Flag. reasons (F): why the frame cannot be used, "" when it
     can. preview: the first usable frame, reduced, grey. image_size: (width, height) of the frames, px. histories: what
-    each of the sessions recorded of the camera's surroundings; empty when that is not known.
+    each of the sessions recorded of the camera's surroundings; empty when that is not known. not_known: what arrays and
+    tables do not say (times, air, supply, set_points, uncertainty), and what is taken instead.
     """
 
     target: Target
@@ -147,6 +148,7 @@ class Observations:
     flags: NDArray[np.uint8]
     reasons: tuple[str, ...]
     histories: tuple[ThermalHistory, ...] = ()
+    not_known: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def usable(self) -> Mask:
@@ -409,6 +411,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         step_id=tuple(step_id for part in parts for step_id in part.step_id),
         reasons=tuple(reason for part in parts for reason in part.reasons),
         histories=tuple(history for part in parts for history in part.histories),
+        not_known={name: text for part in parts for name, text in part.not_known.items()},
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in (*columns, "flags")},
     )
 

@@ -38,6 +38,7 @@ FILES = {
     "target": ("target-file", "A target"),
     "geometry": ("geometry-file", "A stand's geometry"),
     "details": ("details-file", "Details of a measurement"),
+    "mapping": ("mapping-file", "A mapping of a table"),
 }
 
 

@@ -18,7 +18,6 @@ from thermostand.compensation.apply.image_correction import (
     write_image,
 )
 from thermostand.compensation.apply.runtime_export import export_c, export_ros2, export_runtime
-from thermostand.compensation.array_observations import Row, parse_column, read_rows
 from thermostand.compensation.camera_selection import (
     find_camera_name,
     list_camera_frames,
@@ -30,6 +29,7 @@ from thermostand.compensation.drift.drift_model import DriftModel, Outside
 from thermostand.compensation.drift.model_file import load_model
 from thermostand.compensation.drift.paper_model import PaperModel
 from thermostand.compensation.history.thermal_history import Float, States, compute_states_at, read_history
+from thermostand.compensation.spreadsheet import Spreadsheet, read_spreadsheet
 from thermostand.experiments.steps import Role
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
@@ -45,28 +45,28 @@ ADDED = ("x_reference_px", "y_reference_px", "var_x_correction_px2", "cov_xy_cor
          "outside")  # fmt: skip
 
 
-def read_points(path: Path) -> list[dict[str, str]]:
-    """The rows of a table with columns x_px and y_px, such as `compensate detect` writes; SessionError when it has
-    none, or a row that does not fit."""
-    rows, columns = read_rows(path, (X, Y), f"it needs {X} and {Y}, as compensate detect writes them")
-    taken = [name for name in ADDED if name in columns]
+def read_points(path: Path) -> Spreadsheet:
+    """A table with columns x_px and y_px, such as `compensate detect` writes; SessionError when it has none, or a row
+    that does not fit."""
+    table = read_spreadsheet(path)
+    table.require((X, Y), f"it needs {X} and {Y}, as compensate detect writes them")
+    taken = [name for name in ADDED if table.has(name)]
     if taken:
         raise SessionError(f"{path}: has a column {taken[0]} already; these points have been corrected")
-    return rows
+    return table
 
 
-def parse_times(path: Path, rows: Sequence[Row]) -> list[int]:
-    """(M,): the instants, ns; ConfigError when a row has none."""
-    found: list[int] = []
-    for line, row in enumerate(rows, 2):
-        text = row.get(TIME, "").strip()
-        if not text.isdecimal():
-            raise ConfigError(f"{path}: line {line}: {TIME} is {text!r}; --session needs the instant of every point")
-        found.append(int(text))
-    return found
+def parse_times(table: Spreadsheet) -> list[int]:
+    """(M,): the instants, ns; SessionError when a row has none."""
+    if not table.has(TIME):
+        raise ConfigError(f"{table.path}: has no column {TIME}; --session needs the instant of every point")
+    for row, text in enumerate(table.column(TIME)):
+        if not text:
+            raise table.fault(row, f"{TIME} is empty; --session needs the instant of every point")
+    return table.whole_numbers(TIME, 2**63 - 1).tolist()
 
 
-def write_corrected(path: Path, rows: Sequence[Row], xy_px: Float, model: DriftModel, states: States) -> None:
+def write_corrected(path: Path, table: Spreadsheet, xy_px: Float, model: DriftModel, states: States) -> None:
     """The table with columns added: the corrected place, the covariance of the correction, and why it is an
     extrapolation (names of Outside joined by `|`, empty inside the calibrated range). nan where it is unknown.
 
@@ -76,11 +76,9 @@ def write_corrected(path: Path, rows: Sequence[Row], xy_px: Float, model: DriftM
     flags = model.flags(xy_px, states)
     with open_atomic(path) as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*(rows[0] if rows else (X, Y)), *ADDED])
-        for index, row in enumerate(rows):
-            writer.writerow(
-                [*row.values(), *_format_added_cells(corrected[index], covariance[index], int(flags[index]))]
-            )
+        writer.writerow([*table.names, *ADDED])
+        for index, row in enumerate(zip(*table.cells, strict=True)):
+            writer.writerow([*row, *_format_added_cells(corrected[index], covariance[index], int(flags[index]))])
 
 
 def _format_added_cells(place_px: Float, covariance_px2: Float, flags: int) -> Iterator[str]:
@@ -245,23 +243,23 @@ def _correct_points(
     model: DriftModel, source: Path, out: Path, session: Session | None, camera_degC: float | None
 ) -> DriftModel:
     """The form that it was done with."""
-    rows = read_points(source)
-    xy_px = np.column_stack([parse_column(source, rows, X), parse_column(source, rows, Y)])
+    table = read_points(source)
+    xy_px = np.column_stack([table.numbers(X), table.numbers(Y)])
     if session is not None:
         _refuse(("--camera-degC", camera_degC), why="the session has it")
-        states = _read_recorded_states(model, session, parse_times(source, rows))
+        states = _read_recorded_states(model, session, parse_times(table))
         model = model.of_sessions([session.metadata.get("session_id", "")])
-    elif camera_degC is not None or (rows and CAMERA in rows[0]):
+    elif camera_degC is not None or table.has(CAMERA):
         model = _select_temperature_form(model)
-        degC = parse_column(source, rows, CAMERA) if camera_degC is None else camera_degC
-        states = States.at_degC(degC, len(rows), model.memory)
+        degC = table.numbers(CAMERA) if camera_degC is None else camera_degC
+        states = States.at_degC(degC, len(xy_px), model.memory)
     else:
         raise ConfigError(f"{source}: has no column {CAMERA}; give --session, or --camera-degC")
     _check_known(model, xy_px, states)
-    write_corrected(out, rows, xy_px, model, states)
+    write_corrected(out, table, xy_px, model, states)
     outside = int((model.flags(xy_px, states) != 0).sum())
     if outside:
-        say(f"warning: {outside} of {len(rows)} points are outside the model's valid range")
+        say(f"warning: {outside} of {len(xy_px)} points are outside the model's valid range")
     return model
 
 

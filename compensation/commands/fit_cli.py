@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from thermostand.compensation.array_observations import load_observations
 from thermostand.compensation.budget.budget import Budget, compute_budget
 from thermostand.compensation.budget.budget import format_budget as budget_table
 from thermostand.compensation.budget.geometry import load_geometry
@@ -37,7 +37,7 @@ from thermostand.compensation.drift.rereference import rereference as rereferenc
 from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.observations import Observations, read_session_target
 from thermostand.compensation.reporting.drawing.figures import open_renderer
-from thermostand.compensation.reporting.equipment import list_equipment
+from thermostand.compensation.reporting.equipment import Line, list_equipment
 from thermostand.compensation.reporting.pages import render_datasheet_page, render_pdf, serialise_datasheet
 from thermostand.compensation.reporting.report import (
     NoModel,
@@ -48,6 +48,7 @@ from thermostand.compensation.reporting.report import (
     write_report,
 )
 from thermostand.compensation.reporting.report_numbers import Extras, list_table_positions
+from thermostand.compensation.spreadsheet import is_spreadsheet
 from thermostand.compensation.validation3d.document import load_validation
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import ConfigError, SessionError
@@ -96,7 +97,12 @@ _FORMATS = (".html", ".pdf", ".json")
 
 @app.command("datasheet")
 def write_datasheet(
-    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions of one camera.")],
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION...|CENTRES.csv", help="Folders of sessions of one camera, or a table of centres."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE.html|pdf|json", help="The file to write.")],
     *,
     model: Annotated[Path | None, typer.Option(help="Score this model; else one is fitted to the sessions.")] = None,
@@ -116,7 +122,7 @@ def write_datasheet(
     given = None if model is None else load_model(model)
     observations = finding.observed(sessions, camera)
     sheet = compute_datasheet(observations, given or fit_model(observations), stated)
-    equipment = list_equipment(Session.open(sessions[0]))
+    equipment = _list_equipment(sessions[0], observations)
     if out.suffix.lower() == ".json":
         write_atomically(out, serialise_datasheet(sheet, equipment))
     elif out.suffix.lower() == ".pdf":
@@ -125,10 +131,14 @@ def write_datasheet(
         write_atomically(out, render_datasheet_page(sheet, equipment))
     known = sum(one.value == one.value for one in sheet.quantities)
     line = f"{out}: {known} of {len(sheet.quantities)} quantities, with U (k = 2)"
-    show({"file": out, "quantities": sheet.quantities}, [line])
+    data = {"file": out, "quantities": sheet.quantities, "not_known": observations.not_known}
+    show(data, [line, *_list_unknown(observations)])
 
 
-Sessions = Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of recorded sessions.")]
+Sessions = Annotated[
+    list[Path],
+    typer.Argument(metavar="SESSION...|CENTRES.csv", help="Folders of recorded sessions, or a table of centres."),
+]
 DegreeOption = Annotated[
     int | None,
     typer.Option(help=f"Degree of the paper's polynomial, 1 to {MAX_DEGREE}; else chosen by cross-validation."),
@@ -157,8 +167,9 @@ def fit(
 ) -> None:
     """Fit the drift model to the reference, fit and warm-up frames of sessions of one camera.
 
-    A table has a row for each centre: frame, marker, x_px, y_px, camera_degC, and where known time_ns, chamber_degC,
-    role, air_degC, var_x_px2, cov_xy_px2, var_y_px2. It needs no session and no stand.
+    A table, as `compensate observe` or a spreadsheet of any country writes it, has a row for each centre: frame,
+    marker, x_px, y_px, camera_degC, and where known time_ns, chamber_degC, role, air_degC, var_x_px2, cov_xy_px2,
+    var_y_px2, width_px, height_px, session. It needs no session and no stand.
 
     One session does not show how well sessions repeat: a dead zone in a mount or a thermometer far from the camera may
     err by 20 mpx and more in another one. What that adds is assumed then, and the model says so; two sessions over the
@@ -174,10 +185,7 @@ def fit(
     if like and (form == "paper" or degree is not None):
         raise ConfigError("--like fits the thermal form, which has no degree; leave out --form and --degree")
     units = [get_thermal_form(load_model(path)) for path in like or ()]
-    if any(path.suffix.lower() == ".csv" for path in sessions):
-        observations = _load_table(sessions)
-    else:
-        observations = finding.observed(sessions, camera)
+    observations = finding.observed(sessions, camera)
     model = fit_like(observations, units) if units else fit_model(observations, degree, form, say)
     evaluation, unscored = _try_evaluate(model, observations)
     save_model(model, out)
@@ -192,7 +200,8 @@ def fit(
     scored = f"what it gains is not known: {unscored}" if evaluation is None else format_table(evaluation)
     scores = {"not_scored": unscored} if evaluation is None else _describe_scores(evaluation)
     left_out = [f"{count} frames are left out: {reason}" for reason, count in observations.left_out.items()]
-    lines = [f"{model.form}: {model.title}", *left_out, *stepped, scored]
+    lines = [f"{model.form}: {model.title}", *_list_unknown(observations), *left_out, *stepped, scored]
+    data |= {"not_known": observations.not_known}
     show({**data, "left_out": observations.left_out, "unrepeated": named, "between_sessions": repeats, **scores}, lines)
 
 
@@ -227,6 +236,17 @@ def _try_evaluate(model: DriftModel, observations: Observations) -> tuple[Evalua
         return None, str(error)
 
 
+def _list_unknown(observations: Observations) -> list[str]:
+    return [f"not known: {text}" for text in observations.not_known.values()]
+
+
+def _list_equipment(source: Path, observations: Observations) -> list[Line]:
+    """What a session was recorded with; of a table, what it does not say."""
+    if is_spreadsheet(source):
+        return [("Not known", text) for text in observations.not_known.values()]
+    return list_equipment(Session.open(source))
+
+
 def _format_bump(bump: Bump, observations: Observations) -> str:
     utc = next(facts.utc for facts in observations.sessions if facts.session_id == bump.session_id)
     when = f"{utc.date_time(bump.after_ns)} and {utc.date_time(bump.before_ns)}"
@@ -244,12 +264,6 @@ def _describe_scores(evaluation: Evaluation) -> dict[str, object]:
     }
 
 
-def _load_table(paths: list[Path]) -> Observations:
-    if len(paths) > 1:
-        raise ConfigError(f"{paths[1]}: a table of centres is fitted by itself; give one file, or sessions")
-    return load_observations(paths[0])
-
-
 def _collect_extras(
     sessions: list[Path],
     camera: str | None,
@@ -258,12 +272,15 @@ def _collect_extras(
     validation: Path | None,
     details: Path | None,
 ) -> Extras:
+    """equipment is still to be added. ConfigError for a table with --budget."""
+    recorded = [path for path in sessions if not is_spreadsheet(path)]
+    if budget is not None and len(recorded) < len(sessions):
+        raise ConfigError("--budget needs recorded sessions: a table of centres says nothing of the stand")
     return Extras(
         details=load_details(details),
-        budgets={} if budget is None else compute_budgets(sessions, camera, budget, load_optional_target(target)),
-        positions=list_table_positions([Session.open(path).steps() for path in sessions]),
+        budgets={} if budget is None else compute_budgets(recorded, camera, budget, load_optional_target(target)),
+        positions=list_table_positions([Session.open(path).steps() for path in recorded]),
         validation=None if validation is None else load_validation(validation),
-        equipment=list_equipment(Session.open(sessions[0])),
     )
 
 
@@ -296,6 +313,7 @@ def report(
         _collect_extras(sessions, camera, budget, finding.target, validation, details),
     )
     observations = finding.observed(sessions, camera)
+    extras = replace(extras, equipment=_list_equipment(sessions[0], observations))
     with open_renderer(finding.workers) as draw:
         if given is None:
             used, evaluation, refusal = fit_and_evaluate(observations)
@@ -308,5 +326,6 @@ def report(
     alone = f"drift alone: a model needs reference and fit frames, usable are {observations.roles_text}"
     alone = f"the model is not scored: {refusal}" if refusal else alone
     scores = {} if evaluation is None else _describe_scores(evaluation)
-    lines = [alone if evaluation is None else format_table(evaluation)]
-    show({"report": out, "numbers": get_numbers_path(out), **scores}, lines)
+    lines = [alone if evaluation is None else format_table(evaluation), *_list_unknown(observations)]
+    numbers = {"report": out, "numbers": get_numbers_path(out), "not_known": observations.not_known}
+    show({**numbers, **scores}, lines)

@@ -11,12 +11,15 @@ from typing import Annotated
 
 import typer
 
+from thermostand.compensation.array_observations import load_observations
 from thermostand.compensation.camera_selection import select_camera
 from thermostand.compensation.finding.finder import finder
 from thermostand.compensation.observations import Observations, observe
+from thermostand.compensation.spreadsheet import is_spreadsheet
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.output import say
 from thermostand.foundation.progress import Report, progress, show_late_progress
+from thermostand.markers.corner_board import BoardOfCorners, load_corner_board
 from thermostand.markers.detections_table import format_noise_warning
 from thermostand.markers.target import Target, load_target
 from thermostand.recording.reading.session import Say, Session, open_whole
@@ -60,8 +63,12 @@ class MarkerSearch:
     incomplete: Incomplete = False
 
     def observed(self, sessions: Sequence[Path], camera: str | None) -> Observations:
-        """The markers of the sessions. Raises as `observe`, and ConfigError for a target that is neither a file nor
-        installed."""
+        """The markers of the sessions, or of one table of centres. Raises as `observe` and `load_observations`, and
+        ConfigError for a target that is neither a file nor installed."""
+        if any(is_spreadsheet(path) for path in sessions):
+            if len(sessions) > 1:
+                raise ConfigError(f"{sessions[1]}: a table of centres is used by itself; give one file, or sessions")
+            return load_observations(sessions[0])
         wanted, found_by = load_optional_target(self.target), finder(self.workers, self.cluster, use_cache=self.cache)
         warn = make_warning_sink(self.incomplete)
         return observe(sessions, progress, wanted, found_by, across_gap=self.across_gap, incomplete=warn, camera=camera)
@@ -83,6 +90,12 @@ def load_target_by_name(name: str) -> Target:
     if name.removesuffix(".yaml") not in known:
         raise ConfigError(f"{name}: no such file, and not one of the installed targets: {', '.join(known)}")
     return load_target(known[name.removesuffix(".yaml")])
+
+
+def load_board(name: str) -> Target | BoardOfCorners:
+    """A board of squares or tags when the file says so, else a target of dots."""
+    corners = load_corner_board(Path(name)) if Path(name).is_file() else None
+    return corners or load_target_by_name(name)
 
 
 def load_optional_target(name: str | None) -> Target | None:

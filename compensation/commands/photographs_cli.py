@@ -27,18 +27,19 @@ from thermostand.compensation.calibration.views import (
 )
 from thermostand.compensation.commands.options import (
     MegapixelsOption,
-    load_target_by_name,
+    load_board,
     report_marker_search,
     say_left_out,
 )
+from thermostand.compensation.pictures import measure_points
 from thermostand.foundation.command_app import App
 from thermostand.foundation.errors import CalibrationError, ConfigError
 from thermostand.foundation.files import check_folder_writable, make_folder, write_atomically
 from thermostand.foundation.image_limit import GREATEST_MEGAPIXELS, allow_images_up_to
 from thermostand.foundation.output import show
 from thermostand.foundation.progress import Report
-from thermostand.markers.corner_board import BoardOfCorners, SIGMA_px, find_corners, load_corner_board
-from thermostand.markers.detection import DetectionError, Image, detect
+from thermostand.markers.corner_board import BoardOfCorners
+from thermostand.markers.detection import DetectionError
 from thermostand.markers.image_file import read_image
 from thermostand.markers.target import Target
 
@@ -259,12 +260,6 @@ def format_summary(
     return "\n".join(lines)
 
 
-def load_board(name: str) -> Target | BoardOfCorners:
-    """A board of squares or tags when the file says so, else a target of dots."""
-    corners = load_corner_board(Path(name)) if Path(name).is_file() else None
-    return corners or load_target_by_name(name)
-
-
 def make_prior_board(board: Target | BoardOfCorners) -> Board:
     """What is known of it before a calibration."""
     return make_board(board) if isinstance(board, Target) else make_corner_board(board)
@@ -291,7 +286,7 @@ def collect_views(
             continue
         try:
             pixels = read_image(path)
-            found, covariance, is_suspect = _measure_points(pixels, board)
+            found, covariance, is_suspect, _ = measure_points(pixels, board)
         except DetectionError as error:
             failures.append(f"{name}: {str(error).removeprefix(f'{path}: ')}")
             continue
@@ -310,12 +305,3 @@ def collect_views(
             f"the target is in none of the pictures: {failures[0] if failures else 'there are none'}"
         )
     return Views(centres, covariances, size)
-
-
-def _measure_points(image: Image, target: Target | BoardOfCorners) -> tuple[Float, Float, bool]:
-    """Points (N, 2) px and their covariances (N, 2, 2) in a picture, and whether these are suspect; DetectionError
-    when the target is not in it."""
-    if isinstance(target, Target):
-        found = detect(image, target)
-        return found.centres_px, found.covariance_px2, found.is_suspect
-    return find_corners(image, target), np.tile(SIGMA_px**2 * np.eye(2), (target.count, 1, 1)), False

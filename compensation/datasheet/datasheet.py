@@ -113,12 +113,19 @@ _FEWEST_MARKERS = 4  # eight numbers for four motions
 @dataclass(frozen=True, slots=True, eq=False)
 class Visits:
     """V visits of set-points of one session, in order of time. moved (V, 4): of MOTIONS, px, px, ppm, urad, from the
-    session's reference. air_degC, camera_degC (V,)."""
+    session's reference. air_degC, camera_degC (V,). by_camera: the air is not known, and the camera's own temperature
+    stands for it."""
 
     air_degC: Float
     camera_degC: Float
     chamber_degC: Float
     moved: Float
+    by_camera: bool = False
+
+    @property
+    def base_degC(self) -> Float:
+        """(V,): what the image's motion is counted per K of."""
+        return self.camera_degC if self.by_camera else self.air_degC
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,16 +162,18 @@ def fit_motions(observations: Observations) -> Float:
 
 
 def collect_visits(observations: Observations, moved: Float, session: int) -> Visits:
-    """Frames of one set-point that follow each other are a visit; those without air or markers do not count."""
+    """Frames of one set-point that follow each other are a visit; those without markers, or without air in a
+    session that has it, do not count."""
     own = observations.of(*SET_POINTS) & (observations.session == session) & np.isfinite(moved[:, 0])
-    own &= np.isfinite(observations.air_degC)
+    by_camera = not np.isfinite(observations.air_degC[own]).any()
+    own &= by_camera | np.isfinite(observations.air_degC)
     rows: list[Float] = []
     for _, group in groupby(np.flatnonzero(own).tolist(), key=lambda k: float(observations.chamber_degC[k])):
         at = list(group)
         columns = (observations.air_degC[at], observations.camera_degC[at], observations.chamber_degC[at])
         rows.append(np.concatenate([[column.mean() for column in columns], moved[at].mean(axis=0)]))
     table = np.array(rows).reshape(-1, 7)
-    return Visits(table[:, 0], table[:, 1], table[:, 2], table[:, 3:])
+    return Visits(table[:, 0], table[:, 1], table[:, 2], table[:, 3:], by_camera)
 
 
 def find_warm_up(observations: Observations, moved: Float, session: int) -> Warming | None:
@@ -268,9 +277,11 @@ _FEWEST_VISITS = 8  # five coefficients are fitted to them
 _MOST_CORRELATION = 0.9
 _MODEL = (
     "c of y = a + c (T − T0) + b (T − T0)² ± [d + f (T − T0)], + heating, − cooling, by least squares over all visits; "
-    "T: air near the camera, T0: at the reference"
+    "T: {}, T0: at the reference"
 )
-_TOO_FEW = "fewer than eight visits of four set-points with a known air temperature"
+_AIR_MODEL, _CAMERA_MODEL = _MODEL.format("air near the camera"), _MODEL.format("the camera's own sensor")
+_BY_CAMERA = ", per K of the camera's own sensor"
+_TOO_FEW = "fewer than eight visits of four set-points with a known temperature"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,10 +299,10 @@ class Curve:
 
 def fit_curve(visits: Visits, motion: int) -> Curve | None:
     """None when there are too few visits to say how they scatter."""
-    count = len(visits.air_degC)
+    count = len(visits.base_degC)
     if count < _FEWEST_VISITS or len(np.unique(visits.chamber_degC)) < 4:
         return None
-    away_K = visits.air_degC - visits.air_degC[0]
+    away_K = visits.base_degC - visits.base_degC[0]
     side = np.sign(np.diff(visits.chamber_degC, prepend=visits.chamber_degC[0]))
     terms = np.stack([np.ones(count), away_K, away_K**2], axis=1)
     both = (side > 0).sum() > 1 and (side < 0).sum() > 1
@@ -306,14 +317,15 @@ def fit_curve(visits: Visits, motion: int) -> Curve | None:
     alike = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-30)
     alike = min(max(alike, 0.0), _MOST_CORRELATION)
     u_slope = scatter * math.sqrt(float(np.linalg.inv(terms.T @ terms)[1, 1]) * (1 + alike) / (1 - alike))
-    return Curve(float(found[1]), u_slope, float(found[4]) if both else 0.0, scatter, float(np.ptp(visits.air_degC)))
+    return Curve(float(found[1]), u_slope, float(found[4]) if both else 0.0, scatter, float(np.ptp(visits.base_degC)))
 
 
 def compute_coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Iterator[MeasuredQuantity]:
     """Of the four motions."""
     for motion, (key, name, unit) in enumerate(zip(MOTIONS, NAMES, UNITS, strict=True)):
         fitted, per_K = fit_curve(visits, motion), f"{unit}/K"
-        one = MeasuredQuantity(f"{key}_per_K", _GROUP, name, per_K, _MODEL, why=_TOO_FEW)
+        group, model = (f"{_GROUP}{_BY_CAMERA}", _CAMERA_MODEL) if visits.by_camera else (_GROUP, _AIR_MODEL)
+        one = MeasuredQuantity(f"{key}_per_K", group, name, per_K, model, why=_TOO_FEW)
         if fitted is None:
             yield one
             continue
@@ -322,7 +334,7 @@ def compute_coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float
                          "least squares, with the correlation of neighbouring visits"),
             Contribution("slope of heating against cooling", "B", abs(fitted.branches) / math.sqrt(3), per_K,
                          "rectangular, between the slopes of the two branches"),
-            Contribution("span of the air's temperature", "B", math.sqrt(2) * u_air_K, "K",
+            Contribution("span of the temperature", "B", math.sqrt(2) * u_air_K, "K",
                          "thermometer and its place, both ends of the range", fitted.slope / fitted.span_K),
         ]  # fmt: skip
         if key == "scale":
@@ -339,6 +351,7 @@ _LAST_S = 300.0  # round number; nothing was measured
 _MOST_EXPONENTIALS = 10
 _NO_WARM_UP = "no warm-up was recorded at the reference's place"
 _OF_RESIDUALS = "residuals of a line and exponentials"
+_NO_AIR = "no air temperature near the camera"
 _NO_CURVE = "no temperature coefficient to compare with"
 _OF_PLACE = "thermometer and its place"
 
@@ -460,10 +473,10 @@ def _compute_final_rate(warming: Warming | None, scatter: Sequence[float]) -> Me
 
 
 def _compute_self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
-    model, why = "camera's own sensor minus the air near it, at the reference", "no air temperature near the camera"
+    model, why = "camera's own sensor minus the air near it, at the reference", _NO_AIR
     one = _make_unknown_quantity("self_heating_K", "Self-heating, by its own sensor", "K", model, why)
     excess = visits.camera_degC - visits.air_degC
-    if not len(excess):
+    if visits.by_camera or not len(excess):
         return one
     basis = "steps of at most 0.25 K; its offset is unknown"
     return one.found(
@@ -487,6 +500,8 @@ def _compute_camera_share(
     fitted = [fit_curve(visits, axis) for axis in (0, 1)]
     if warming is None:
         return one
+    if visits.by_camera:
+        return replace(one, why=_NO_AIR)
     if fitted[0] is None or fitted[1] is None:
         return replace(one, why=_NO_CURVE)
     slope = np.array([one.slope for one in fitted if one])
@@ -518,7 +533,7 @@ def _compute_surroundings_share(share: MeasuredQuantity) -> MeasuredQuantity:
 @dataclass(frozen=True, slots=True, eq=False)
 class Datasheet:
     """quantities: in the order of the page. by_session: the same of each single session. warming: the first warm-up.
-    air_degC, camera_degC: range of the visits. model: in use."""
+    air_degC, camera_degC: range of the visits, NaN when it is not known. model: in use."""
 
     observations: Observations
     details: MeasurementDetails
@@ -550,7 +565,7 @@ def compute_datasheet(
     warmings: list[Warming | None] = []
     for index, facts in enumerate(observations.sessions):
         own = collect_visits(steady, moved, index)
-        if not len(own.air_degC):
+        if not len(own.base_degC):
             continue
         scatter = _estimate_unrepeated(own, model)
         visits.append(own)
@@ -563,7 +578,7 @@ def compute_datasheet(
             )
         )
     if not by_session:
-        raise SessionError("no session has frames at set-points with a known air temperature; there is no datasheet")
+        raise SessionError("no session has frames at set-points; there is no datasheet")
     pooled = [pool_sessions(same) for same in zip(*by_session, strict=True)]
     scatter = _estimate_unrepeated(visits[0], model)
     left = [one for form in FORMS for one in compute_residual_quantities(form, evaluations.get(form), scatter)]

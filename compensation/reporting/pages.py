@@ -78,7 +78,9 @@ def format_mpx(value_px: float, digits: int = 1) -> str:
 
 
 def format_utc(instant: str) -> str:
-    """ISO 8601 to what is read on a page."""
+    """ISO 8601 to what is read on a page; of nothing, that it is not known."""
+    if not instant:
+        return "at unknown times"
     return f"{instant[:16].replace('T', ' ')} UTC"
 
 
@@ -164,7 +166,7 @@ def render_datasheet_page(sheet: Datasheet, equipment: Sequence[Line] = ()) -> s
         f"Thermal datasheet of camera {sheet.model.facts.camera_serial}",
         _draw_datasheet_figures(sheet),
         sheet=sheet,
-        span=[_format_utc_ns(ns) for ns in _compute_span_ns(sheet)],
+        span=_format_span(sheet) or ["at unknown times"],
         groups=[(name, [*members]) for name, members in groupby(sheet.quantities, key=lambda one: one.group)],
         unknown=unknown,
         measured_with=[*list_stated_details(sheet.details, sheet.observations.target), *equipment],
@@ -186,9 +188,9 @@ def serialise_datasheet(sheet: Datasheet, equipment: Sequence[Line] = ()) -> str
         "camera": facts.camera_serial,
         "simulated": sheet.observations.simulated,
         "sessions": [one.session_id for one in sheet.observations.sessions],
-        "recorded": [_format_utc_ns(one) for one in _compute_span_ns(sheet)],
+        "recorded": _format_span(sheet),
         "coverage_factor": COVERAGE,
-        "air_degC": sheet.air_degC,
+        "air_degC": [_none_if_not_finite(value) for value in sheet.air_degC],
         "camera_degC": sheet.camera_degC,
         "model": {"form": sheet.model.form, "title": sheet.model.title},
         "equipment": dict(equipment),
@@ -231,10 +233,14 @@ def _none_if_not_finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _compute_span_ns(sheet: Datasheet) -> tuple[int, int]:
+def _format_span(sheet: Datasheet) -> list[str]:
+    """When the first and the last frame were taken; nothing where that is not known."""
     observed = sheet.observations
+    if "times" in observed.not_known:
+        return []
     utc = [observed.sessions[index].utc for index in (observed.session[0], observed.session[-1])]
-    return utc[0].utc_ns(int(observed.time_ns[0])), utc[1].utc_ns(int(observed.time_ns[-1]))
+    instants = utc[0].utc_ns(int(observed.time_ns[0])), utc[1].utc_ns(int(observed.time_ns[-1]))
+    return [_format_utc_ns(ns) for ns in instants]
 
 
 def _format_utc_ns(ns: int) -> str:

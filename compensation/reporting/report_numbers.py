@@ -271,6 +271,8 @@ def _summarise_session(observations: Observations, index: int) -> SessionNumbers
     flags = observations.flags[used]
     by_flag = {(flag.name or "").lower().replace("_", " "): int(((flags & flag) != 0).sum()) for flag in Flag}
     by_role = {str(role): int((own & (observations.role == str(role))).sum()) for role in Role}
+    instants = [facts.utc.utc_ns(int(time_ns)) for time_ns in observations.time_ns[own][[0, -1]]]
+    begin, end = ("", "") if "times" in observations.not_known else map(_format_instant, instants)
     return SessionNumbers(
         session_id=facts.session_id,
         recipe=facts.recipe,
@@ -278,8 +280,8 @@ def _summarise_session(observations: Observations, index: int) -> SessionNumbers
         software_version=facts.software_version,
         simulated=facts.simulated,
         incomplete_segments=facts.incomplete,
-        begin=_format_instant(facts.utc.utc_ns(int(observations.time_ns[own][0]))),
-        end=_format_instant(facts.utc.utc_ns(int(observations.time_ns[own][-1]))),
+        begin=begin,
+        end=end,
         frames=int(own.sum()),
         frames_by_role={role: count for role, count in by_role.items() if count},
         unusable=int((own & ~observations.usable).sum()),

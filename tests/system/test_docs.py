@@ -23,6 +23,7 @@ from tests.installed import install
 from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
+from thermostand.compensation.measurement_mapping import MeasurementMapping
 from thermostand.experiments.steps import make_step
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.events import GUARD, KINDS
@@ -147,6 +148,8 @@ def test_what_is_written_in_a_file_is_taken(block: Block):
         parse_document(block.text, AlertSecrets, name)
     elif "lens" in data:
         parse_document(block.text, MeasurementDetails, name)
+    elif "columns" in data:
+        parse_document(block.text, MeasurementMapping, name)
     elif "scrape_configs" in data:  # Prometheus'
         assert data["scrape_configs"][0]["static_configs"]
     else:

@@ -23,6 +23,7 @@ _SOURCE = re.compile(r"\.(text|reason|args)\b|\b(str|repr)\(")
 # Shown, not decided upon: the sentence of an error with the file's name as it is within the session.
 SHOWN = {
     ("compensation/commands/photographs_cli.py", "collect_views"),
+    ("compensation/pictures.py", "measure_chunk"),
     # Compared with what was reported before and nothing else: whether a message repeats.
     ("foundation/repeat_limit.py", "_admit_sentence"),
 }

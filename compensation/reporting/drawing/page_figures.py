@@ -142,24 +142,25 @@ _COLOURS = (I_COLOUR, J_COLOUR, "#009E73", CAMERA_COLOUR)
 def draw_over_temperature(sheet: Datasheet) -> Figure:
     """Each visit: full after heating, open after cooling; the line is the stated coefficient at the reference."""
     first, shown = sheet.visits[0], list[Panel]()
-    ends = np.array([first.air_degC.min(), first.air_degC.max()])
+    ends = np.array([first.base_degC.min(), first.base_degC.max()])
     for motion, one in enumerate(sheet.quantities[: len(UNITS)]):
         marks = [mark for visits in sheet.visits for mark in _mark_visits(visits, motion)]
         if np.isfinite(one.value):
             label = f"{one.value:.3g} {one.unit} at the reference".replace("-", "−")
-            at = first.moved[0, motion] + one.value * (ends - first.air_degC[0])
+            at = first.moved[0, motion] + one.value * (ends - first.base_degC[0])
             marks.append(make_curve(ends, at, GREY, label, linewidth=0.9, linestyle="--"))
-        below = "air near the camera (°C)" if motion > 1 else ""
+        whose = "camera's own sensor" if first.by_camera else "air near the camera"
+        below = f"{whose} (°C)" if motion > 1 else ""
         shown.append(Panel(marks, look={"xlabel": below, "ylabel": _LABELS[motion]}))
     return draw_panels(2, 5.2, shown, share=False)
 
 
 def _mark_visits(visits: Visits, motion: int) -> Iterator[Mark]:
     side = np.sign(np.diff(visits.chamber_degC, prepend=visits.chamber_degC[0]))
-    air_degC, moved, colour = visits.air_degC, visits.moved[:, motion], _COLOURS[motion]
-    yield make_curve(air_degC, moved, colour, linewidth=0.6, alpha=0.5)
+    base_degC, moved, colour = visits.base_degC, visits.moved[:, motion], _COLOURS[motion]
+    yield make_curve(base_degC, moved, colour, linewidth=0.6, alpha=0.5)
     for rows, face in ((side >= 0, colour), (side < 0, "white")):
-        yield make_curve(air_degC[rows], moved[rows], colour, marker="o", linestyle="", markerfacecolor=face)
+        yield make_curve(base_degC[rows], moved[rows], colour, marker="o", linestyle="", markerfacecolor=face)
 
 
 def draw_warm_up(warming: Warming, settled_s: float) -> Figure:
