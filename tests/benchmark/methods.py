@@ -1,5 +1,5 @@
-"""The methods that are compared: nothing, the paper's polynomial, the form that is chosen (of all these cameras the
-thermal one), and Gaussian processes on what that leaves."""
+"""The methods that are compared: nothing, temperature bins as a depth camera has them, the paper's polynomial, the form
+that is chosen (of all these cameras the thermal one), and Gaussian processes on what that leaves."""
 
 from __future__ import annotations
 
@@ -30,6 +30,47 @@ def nothing(training: Observations) -> Corrector:
 def paper(training: Observations) -> Corrector:
     """The paper's polynomial."""
     return corrector(fit(training, form="paper"))
+
+
+BINS, BINS_DEGC = 29, (0.0, 75.0)
+"""As in the table of a depth camera that ships in millions: bins of its own temperature."""
+
+
+def temperature_bins(training: Observations) -> Corrector:
+    """In each bin of the camera's temperature the median corners against those at the reference, and the similarity
+    (scale times cosine and sine, two shifts) between them; in an empty bin that of the nearest one that is not. A
+    depth camera sold in millions corrects its colour image so; it is made on the line from one warm-up."""
+    frames = np.flatnonzero(training.of(Role.REFERENCE, Role.FIT, Role.WARM_UP))
+    reference_px = np.nanmedian(training.centres_px[training.of(Role.REFERENCE)], axis=0)
+    bins = _find_bins(training.camera_degC[frames])
+    found = np.full((BINS, 4), np.nan)
+    for number in np.unique(bins):
+        seen_px = np.nanmedian(training.centres_px[frames[bins == number]], axis=0)
+        known = np.isfinite(seen_px + reference_px).all(axis=1)
+        terms = _similarity_terms(seen_px[known])
+        found[number] = np.linalg.lstsq(terms, (reference_px - seen_px)[known].ravel(), rcond=None)[0]
+    filled = np.flatnonzero(np.isfinite(found[:, 0]))
+
+    def corrected(night: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
+        wanted = _find_bins(night.camera_degC[asked])
+        nearest = filled[np.abs(wanted[:, None] - filled).argmin(axis=1)]
+        moved = [
+            (_similarity_terms(seen) @ found[one]).reshape(-1, 2) for seen, one in zip(seen_px, nearest, strict=True)
+        ]
+        return Correction(seen_px + np.array(moved))
+
+    return corrected
+
+
+def _find_bins(camera_degC: Float) -> NDArray[np.int64]:
+    low, high = BINS_DEGC
+    return np.clip((camera_degC - low) / (high - low) * BINS, 0, BINS - 1).astype(np.int64)
+
+
+def _similarity_terms(xy_px: Float) -> Float:
+    """(2 N, 4): dx = a + s x - r y, dy = b + s y + r x, for points (N, 2)."""
+    (x, y), one = xy_px.T / 1000, np.ones(len(xy_px))
+    return np.stack([one, 0 * one, x, -y, 0 * one, one, y, x], axis=1).reshape(-1, 4)
 
 
 @lru_cache(maxsize=1)
@@ -124,6 +165,7 @@ class _Gp:
 
 METHODS: dict[str, Method] = {
     "nothing": nothing,
+    "29 temperature bins of a similarity": temperature_bins,
     "the paper's polynomial": paper,
     "the form that is chosen": chosen,
     "and a GP on its residual": gp_on_residual,
