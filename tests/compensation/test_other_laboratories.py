@@ -129,7 +129,7 @@ def test_pictures_with_the_temperature_in_their_names_give_a_model_a_report_and_
     assert sheet["recorded"] == []
     found = {one["key"]: one for one in sheet["quantities"]}
     for key, truth in (("shift_I_per_K", SHIFT_PX_PER_K), ("scale_per_K", PPM_PER_K)):
-        assert abs(found[key]["value"] - truth) < 1.5 * found[key]["expanded"]
+        assert abs(found[key]["value"] - truth) < 1.5 * found[key]["expanded_uncertainty"]
     assert found["self_heating_K"]["value"] is None
     assert found["camera_share"]["value"] is None
 
