@@ -188,13 +188,21 @@ class VirtualClock:
     When time moves, `advance(time_ns)` informs the simulator and waits for its answer before anybody is woken. The new
     time holds from then on: what comes from outside meanwhile, such as a signal, must not date what it does to the
     simulator before it, or the time between would seem to have passed without effect.
+
+    `await_answers` blocks until the simulated devices have answered all that has arrived at them.
     """
 
     lead_ns = 0
 
-    def __init__(self, start_ns: int, advance: Callable[[int], Awaitable[None]] | None = None) -> None:
+    def __init__(
+        self,
+        start_ns: int,
+        advance: Callable[[int], Awaitable[None]] | None = None,
+        await_answers: Callable[[], None] | None = None,
+    ) -> None:
         self._now_ns = start_ns
         self._advance = advance
+        self.await_answers = await_answers
         self._holds = 0
         self._sleepers: list[tuple[int, int, asyncio.Future[None]]] = []
         self._order = itertools.count()
@@ -260,6 +268,15 @@ def compute_call_pause_s(clock: Now, pause_s: float) -> float:
     """Real seconds to keep between two calls of a device that wants `pause_s`. In virtual time a call takes none, so
     none pass between the calls of one instant, and those of two instants are apart on the clock."""
     return 0.0 if isinstance(clock, VirtualClock) else pause_s
+
+
+def await_simulated_answers(clock: Now | None) -> bool:
+    """Whether a reply that has not come by now never comes, since the simulated devices have answered all that was
+    asked: they are waited for, however busy the host. False at once in real time, where nobody can know."""
+    if not isinstance(clock, VirtualClock) or clock.await_answers is None:
+        return False
+    clock.await_answers()
+    return True
 
 
 def block_until(clock: Now, time_ns: int) -> None:

@@ -99,7 +99,7 @@ class Probe:
             settings.baud or as_delivered.baud, as_delivered.stopbits, as_delivered.parity, as_delivered.databits
         )
         self._client = LineClient.at(
-            name, settings.address, line, (settings.timeout_s, compute_call_pause_s(clock, _GAP_S))
+            name, settings.address, line, (settings.timeout_s, compute_call_pause_s(clock, _GAP_S)), clock=clock
         )
 
     async def open(self) -> None:

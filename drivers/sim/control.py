@@ -1,6 +1,7 @@
 """The simulator's control socket: time, truth and faults. One JSON object a line in, one out.
 
     {"do": "advance", "now_ns": N}              -> {"now_ns": N}       virtual time moves to N
+    {"do": "settle"}                            -> {}                  all that has arrived on the wires is answered
     {"do": "state"}                             -> {"now_ns": N, "air_degC": ...}   the plant's true state
     {"do": "optics"}                            -> {"centres_px": [[x, y], ...]}   noise-free marker centres
     {"do": "fault", "name": S, "value": V}      -> {"name": S}         one of drivers.sim.laboratory_faults.FAULTS
@@ -53,6 +54,9 @@ class Control:
             case {"do": "advance", "now_ns": int(now_ns)}:
                 self._schedule.advance(now_ns)
                 return {"now_ns": now_ns}
+            case {"do": "settle"}:
+                self._laboratory.settle()
+                return {}
             case {"do": "state"}:
                 return dict(self._laboratory.state())
             case {"do": "unplayed"}:

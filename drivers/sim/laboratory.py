@@ -269,6 +269,11 @@ class Laboratory:
         for camera in self.cameras.values():
             camera.advance(now_ns)
 
+    def settle(self) -> None:
+        """Return when everything that has arrived on any wire is answered, or late on purpose."""
+        for link in self._links.values():
+            link.wire.settle()
+
     def state(self) -> dict[str, float]:
         """The plant's true state now; `now_ns` is the laboratory's time. The flap is faster than the plant's grid."""
         with self.plant.at(self.clock) as now_ns:

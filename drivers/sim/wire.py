@@ -58,6 +58,13 @@ class LinkFaults:
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
+        self.is_late = False  # a reply is kept back on purpose
+
+    def _wait(self, late_s: float) -> None:
+        """A slow line is slow in real seconds."""
+        self.is_late = True
+        time.sleep(late_s)  # noqa: TID251 - as above
+        self.is_late = False
 
     def apply(self, request: bytes, reply: bytes) -> list[bytes]:
         """The pieces to write instead of `reply`; may wait delay_s first. Nothing when there was no reply."""
@@ -67,13 +74,13 @@ class LinkFaults:
             return [reply]
         if self.delay_s > 0:
             self._count("delay")
-            time.sleep(self.delay_s)  # noqa: TID251 - a slow line is slow in real seconds
+            self._wait(self.delay_s)
         if self.late_s > 0:
             late_s, self.late_s = self.late_s, 0.0
             self._count("late")
-            time.sleep(late_s)  # noqa: TID251 - as above
+            self._wait(late_s)
         if self._chance(self.late, "late"):
-            time.sleep(self.late_by_s)  # noqa: TID251 - as above
+            self._wait(self.late_by_s)
         if self.garbled > 0:
             self.garbled -= 1
             self._count("garbled")
@@ -122,6 +129,29 @@ class Engine(Protocol):
         ...
 
 
+_LOOK_S = 0.0002  # between two looks at a wire that is behind
+
+
+def _is_behind(source: socket.socket | int, turn: threading.Lock, faults: LinkFaults) -> bool:
+    """Whether something that has arrived there is not answered yet. turn: held from before a request is taken to after
+    its reply was sent. What is late on purpose is not behind."""
+    if not turn.acquire(blocking=False):
+        return not faults.is_late
+    try:
+        return _await_input(source, 0.0)
+    except (OSError, ValueError):
+        return False  # closed
+    finally:
+        turn.release()
+
+
+def _await_input(source: socket.socket | int, timeout_s: float | None = None) -> bool:
+    """Whether something has arrived, or the other end has closed. OSError, ValueError when it is closed here."""
+    arrived = select.poll()  # select() knows no descriptor above 1023
+    arrived.register(source, select.POLLIN)
+    return bool(arrived.poll(None if timeout_s is None else timeout_s * 1000.0))
+
+
 class LineEngine:
     """An engine for requests of one line each: `answer(line) -> line`, both without their line feed."""
 
@@ -148,6 +178,7 @@ class PtyWire:
         self._engine = engine
         self._faults = faults
         self._is_plugged = False
+        self._turn = threading.Lock()
         self.address = f"serial:{self._path}"
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._lock = _lock_path(self._path)
@@ -172,12 +203,18 @@ class PtyWire:
             ready, _, _ = select.select([self._master, self._stop_read], [], [])
             if self._stop_read in ready:
                 return
-            try:
-                request = os.read(self._master, 4096)
-            except OSError:
-                return
-            for piece in self._faults.apply(request, self._engine.feed(request)):
-                os.write(self._master, piece)
+            with self._turn:
+                try:
+                    request = os.read(self._master, 4096)
+                except OSError:
+                    return
+                for piece in self._faults.apply(request, self._engine.feed(request)):
+                    os.write(self._master, piece)
+
+    def settle(self) -> None:
+        """Return when all that has arrived is answered, or late on purpose."""
+        while self._is_plugged and _is_behind(self._master, self._turn, self._faults):
+            time.sleep(_LOOK_S)  # noqa: TID251 - for another thread
 
     def close(self) -> None:
         """Unplug for good; may be called twice."""
@@ -222,8 +259,8 @@ class TcpWire:
         self._make_engine = make_engine
         self._faults = faults
         self._host = host
-        self._connections: set[socket.socket] = set()
-        self._lock = threading.Lock()
+        self._connections: dict[socket.socket, threading.Lock] = {}
+        self._lock = threading.Lock()  # of the connections, and held while one is taken
         self._server = self._listening(port)
         self.port: int = self._server.getsockname()[1]
         self.address = f"tcp:{host}:{self.port}"
@@ -235,35 +272,53 @@ class TcpWire:
 
     def _listening(self, port: int) -> socket.socket:
         server = socket.create_server((self._host, port))
+        server.setblocking(False)
         threading.Thread(target=self._accept, args=(server,), name=f"tcp {port}", daemon=True).start()
         return server
 
     def _accept(self, server: socket.socket) -> None:
         while True:
             try:
-                connection, _ = server.accept()
-            except OSError:
+                _await_input(server)
+                with self._lock:
+                    connection, _ = server.accept()
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    turn = self._connections[connection] = threading.Lock()
+            except BlockingIOError:
+                continue  # who connected has gone
+            except (OSError, ValueError):
                 return
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            with self._lock:
-                self._connections.add(connection)
-            threading.Thread(target=self._serve, args=(connection,), name="tcp connection", daemon=True).start()
+            threading.Thread(target=self._serve, args=(connection, turn), name="tcp connection", daemon=True).start()
 
-    def _serve(self, connection: socket.socket) -> None:
+    def _serve(self, connection: socket.socket, turn: threading.Lock) -> None:
         engine = self._make_engine()
         with contextlib.suppress(OSError), connection:
-            is_first = True
-            while request := connection.recv(65536):
-                if self._faults.swallows_first and is_first:
+            is_first = self._faults.swallows_first
+            while connection.recv(1, socket.MSG_PEEK):
+                with turn:
+                    request = connection.recv(65536)
+                    pieces = [] if is_first else self._faults.apply(request, engine.feed(request))
                     is_first = False
-                    continue
-                pieces = self._faults.apply(request, engine.feed(request))
-                for piece in pieces:
-                    connection.sendall(piece)
-                if self._faults.hangs_up and pieces:
-                    break
+                    is_last = self._faults.hangs_up and bool(pieces)
+                    for piece in pieces:
+                        # With the end of the connection: who has the reply can know at once that it was the last.
+                        connection.sendall(piece, socket.MSG_MORE if is_last else 0)
+                    if is_last:
+                        connection.shutdown(socket.SHUT_WR)
+                        break
         with self._lock:
-            self._connections.discard(connection)
+            self._connections.pop(connection, None)
+
+    def settle(self) -> None:
+        """Return when all that has arrived is answered, or late on purpose."""
+        while _is_behind(self._server, self._lock, self._faults) or any(
+            _is_behind(connection, turn, self._faults) for connection, turn in self._list_connections()
+        ):
+            time.sleep(_LOOK_S)  # noqa: TID251 - for other threads
+
+    def _list_connections(self) -> list[tuple[socket.socket, threading.Lock]]:
+        with self._lock:
+            return list(self._connections.items())
 
     def unplug(self) -> None:
         """Close the wire until it is plugged in again."""
@@ -274,9 +329,7 @@ class TcpWire:
         with contextlib.suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
-        with self._lock:
-            connections = list(self._connections)
-        for connection in connections:
+        for connection, _ in self._list_connections():
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
 

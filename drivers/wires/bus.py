@@ -95,7 +95,7 @@ class Bus:
         self.address = settings.address
         self.counters = BusCounters()
         self.clock = clock
-        self._client = ModbusClient(settings)
+        self._client = ModbusClient(settings, clock)
         self._gap_s = compute_call_pause_s(clock, settings.gap_s) if self._client.serial else 0.0
         self._quarantine_s = settings.timeout_s + QUARANTINE_MARGIN_S
         self._worker: WorkerThread | None = None

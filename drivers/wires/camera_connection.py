@@ -141,7 +141,8 @@ PACKET_REQUEST_RATIO = 1.0
 FRAME_RETENTION_PERIODS = 0.9  # below 1, so that Aravis gives a frame up before we stop waiting for it
 SOCKET_BUFFER_FIXED = 0
 
-# Bootstrap registers (GigE Vision 1.2, section 28): timestamp control and latched value.
+# Bootstrap registers (GigE Vision 1.2, section 28): who controls it; timestamp control and latched value.
+CONTROL_PRIVILEGE, IN_CONTROL = 0x0A00, 0b11  # exclusive, or not
 TIMESTAMP_CONTROL, TIMESTAMP_LATCH = 0x0944, 2
 TIMESTAMP_HIGH, TIMESTAMP_LOW = 0x0948, 0x094C
 # A latch whose question and answer took longer than 5 ms is repeated, and the best of three is kept.
@@ -209,7 +210,9 @@ class Connection:
         self._phase_ns = 0  # a begin of exposure in free run; the others lie whole periods away
         self._device = _open_with_control(name, settings)
         try:
-            self._device.on_control_lost(self.control_lost.set)
+            self._is_asked_for_control = self._is_virtual and self._device.is_gige
+            if not self._is_asked_for_control:
+                self._device.on_control_lost(self.control_lost.set)
             self.identity = read_identity(self._device)
             serial_number = self.identity.serial_number
             if settings.serial_number not in (None, serial_number):
@@ -235,6 +238,17 @@ class Connection:
     def running(self) -> bool:
         """Whether acquisition was started."""
         return self._stream is not None
+
+    def check_control(self) -> None:
+        """Ask who controls the camera, in virtual time: Aravis' heartbeat, which asks in real time, would make another
+        session on a busy host."""
+        if self._is_asked_for_control and not self.control_lost.is_set():
+            try:
+                is_held = bool(self._device.read_register(CONTROL_PRIVILEGE) & IN_CONTROL)
+            except AravisError as error:
+                is_held = not is_silence(error)
+            if not is_held:
+                self.control_lost.set()
 
     def close(self) -> None:
         """Stop and let go; never raises, takes up to 7.5 s when the camera is dead, 2.5 s when it is known to be."""

@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from thermostand.drivers.wires.link import CLOSING_S, ByteLink, HangUps, SerialSettings, open_link
+from thermostand.drivers.wires.link import CLOSING_S, ByteLink, HangUps, SerialSettings, open_link, read_reply
+from thermostand.foundation.clock import Now, await_simulated_answers
 from thermostand.foundation.errors import GarbledReply, Unreachable
 
 Answer = TypeVar("Answer")
@@ -24,7 +25,8 @@ _FLOW_CONTROL = b"\x11\x13"  # XON and XOFF, which some units send among their r
 class LineClient:
     """One conversation over a link made by `connect`; blocking, not thread-safe.
 
-    `timeout_s`: real seconds for a whole reply; `gap_s`: of silence between a reply and the next request. A broken link
+    `timeout_s`: real seconds for a whole reply, in virtual time (`clock`) also until the simulated device has nothing
+    left to answer; `gap_s`: of silence between a reply and the next request. A broken link
     is closed and opened again by the next request; while `connected` is False nobody knows who will answer. `is_kept`:
     whether a link survives an error (a serial line); a TCP connection is dropped with what may still come, but for the
     first request over it, which some units swallow. is_text: flow control is no part of a reply; since a flipped bit
@@ -40,6 +42,7 @@ class LineClient:
         *,
         is_kept: bool,
         is_text: bool = True,
+        clock: Now | None = None,
     ) -> None:
         self._device = device
         self._connect = connect
@@ -47,6 +50,7 @@ class LineClient:
         self._gap_s = gap_s
         self._is_kept = is_kept
         self._is_text = is_text
+        self.clock = clock
         self._link: ByteLink | None = None
         self._hang_ups = HangUps()
         self._flow_bytes = 0  # in the last reply
@@ -57,11 +61,21 @@ class LineClient:
 
     @classmethod
     def at(
-        cls, device: str, address: str, line: SerialSettings, times_s: tuple[float, float], *, is_text: bool = True
+        cls,
+        device: str,
+        address: str,
+        line: SerialSettings,
+        times_s: tuple[float, float],
+        *,
+        is_text: bool = True,
+        clock: Now | None = None,
     ) -> LineClient:
-        """Of the device at `serial:PATH`, with these settings, or `tcp:HOST:PORT`; times_s: time-out and gap."""
+        """Of the device at `serial:PATH`, with these settings, or `tcp:HOST:PORT`; times_s: time-out and gap; clock:
+        the stand's, without which a time-out is judged in real time alone."""
         is_kept = address.startswith("serial:")
-        return cls(device, lambda: open_link(device, address, line), *times_s, is_kept=is_kept, is_text=is_text)
+        return cls(
+            device, lambda: open_link(device, address, line), *times_s, is_kept=is_kept, is_text=is_text, clock=clock
+        )
 
     @property
     def connected(self) -> bool:
@@ -129,7 +143,7 @@ class LineClient:
         try:
             link.write(request)
             deadline_s = time.monotonic() + self._timeout_s
-            while (left_s := deadline_s - time.monotonic()) > 0 and (data := link.read(left_s)):
+            while data := read_reply(link, deadline_s, self.clock):
                 heard += data
                 text = heard.translate(None, _FLOW_CONTROL) if self._is_text else heard
                 if (found := answer(text)) is not None:
@@ -159,6 +173,7 @@ class LineClient:
         except Unreachable:
             self.close()
             raise
+        await_simulated_answers(self.clock)  # it is obeyed before time goes on
         self._free_s = time.monotonic() + self._gap_s
 
     def _clean_link(self, *, is_read: bool) -> ByteLink:

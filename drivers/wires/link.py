@@ -8,18 +8,21 @@ import os
 import select
 import socket
 import termios
+import time
 from dataclasses import dataclass
 from typing import Protocol
 
 import serial
 
 from thermostand.foundation.addresses import SerialEndpoint, TcpEndpoint, get_display_address, parse_address
+from thermostand.foundation.clock import Now, await_simulated_answers
 from thermostand.foundation.errors import Unreachable
 
 _CONNECT_S = 1.0  # round number; nothing was measured
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
 _READ_SIZE = 4096
 CLOSING_S = 0.02  # from a reply to the end of its connection: a round trip of a slow network
+DELIVERY_S = 0.02  # from one end of a pseudo-terminal to the other; 0.1 ms on an idle host
 
 
 class ByteLink(Protocol):
@@ -46,6 +49,15 @@ class SerialSettings:
     stopbits: int
     parity: str = "N"
     databits: int = 8
+
+
+def read_reply(link: ByteLink, deadline_s: float, clock: Now | None) -> bytes:
+    """What has arrived until time.monotonic() reaches `deadline_s`; b"" then. In virtual time a host that is busy must
+    not make a silent device: silent is one that has nothing left to answer."""
+    left_s = deadline_s - time.monotonic()
+    if left_s > 0 and (data := link.read(left_s)):
+        return data
+    return link.read(DELIVERY_S) if await_simulated_answers(clock) else b""
 
 
 def open_link(device: str, address: str, settings: SerialSettings) -> ByteLink:

@@ -7,6 +7,7 @@ baud); the subclasses here wait for the first byte instead and say why a port do
 from __future__ import annotations
 
 import logging
+import math
 import select
 import socket
 import struct
@@ -38,7 +39,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
-from thermostand.drivers.wires.link import CLOSING_S, HangUps, explain_closed
+from thermostand.drivers.wires.link import CLOSING_S, DELIVERY_S, HangUps, explain_closed
 from thermostand.drivers.wires.registers import Space
 from thermostand.foundation.addresses import (
     ByteAddress,
@@ -47,6 +48,7 @@ from thermostand.foundation.addresses import (
     get_display_address,
     parse_address,
 )
+from thermostand.foundation.clock import Now, VirtualClock, await_simulated_answers
 from thermostand.foundation.documents import Document
 
 # Messages of Modbus as pymodbus has them, but for what it takes that the standard does not allow.
@@ -189,7 +191,9 @@ class WireFault(Exception):
 
 
 class SerialClient(ModbusSerialClient):
-    """pymodbus over pyserial, without its polling."""
+    """pymodbus over pyserial, without its polling. clock: see ModbusClient."""
+
+    clock: Now | None = None
 
     def connect(self) -> bool:
         """Open the port exclusively; raises OSError with the reason."""
@@ -205,6 +209,8 @@ class SerialClient(ModbusSerialClient):
                 exclusive=True,
             )
             self.socket.reset_input_buffer()  # earlier bytes were not for us
+        if isinstance(self.clock, VirtualClock):
+            self.comm_params.timeout_connect = math.inf  # for the rest of a reply: `recv` knows when there is none
         return True
 
     def recv(self, size: int | None) -> bytes:
@@ -212,14 +218,19 @@ class SerialClient(ModbusSerialClient):
         if self.socket is None:
             raise ConnectionException("port closed")
         first = self.socket.read(1)
+        if not first and await_simulated_answers(self.clock):
+            select.select([self.socket], [], [], DELIVERY_S)
+            first = self.socket.read(min(1, self.socket.in_waiting))
         return first + self.socket.read(self.socket.in_waiting) if first else b""
 
 
 class TcpClient(ModbusTcpClient):
     """pymodbus' messages and frames over TCP. The kernel keeps the time-out: a reply then costs one call of it instead
-    of three. Without pymodbus' transactions, which repeat and look for echoes; neither is wanted here."""
+    of three. Without pymodbus' transactions, which repeat and look for echoes; neither is wanted here. clock: see
+    ModbusClient."""
 
     number = 0  # of the last transaction
+    clock: Now | None = None
 
     def execute(self, no_response_expected: bool, request: ModbusPDU) -> ModbusPDU:
         """The reply to one request, sent once; ModbusIOException when none comes within the time-out."""
@@ -229,7 +240,9 @@ class TcpClient(ModbusTcpClient):
         # register read for 16 to 19. What those checked, the unit and the number of the request, is checked below.
         packet = trace(True, self.framer.buildFrame(request))
         self.send(packet)
-        deadline_s, heard = time.monotonic() + timeout_s, b""
+        # In virtual time `recv` knows when nothing comes any more.
+        deadline_s = math.inf if isinstance(self.clock, VirtualClock) else time.monotonic() + timeout_s
+        heard = b""
         while data := self.recv(None):
             heard = trace(False, heard + data)
             if foreign := _explain_foreign(packet, heard):
@@ -275,12 +288,20 @@ class TcpClient(ModbusTcpClient):
         if self.socket is None:
             raise ConnectionException("connection closed")
         try:
-            data = self.socket.recv(4096)
+            data = self._receive(self.socket)
         except BlockingIOError:
             return b""
         if not data:
             raise ConnectionException("the connection was closed")
         return data
+
+    def _receive(self, opened: socket.socket) -> bytes:
+        try:
+            return opened.recv(4096)
+        except BlockingIOError:
+            if not await_simulated_answers(self.clock):
+                raise
+            return opened.recv(4096, socket.MSG_DONTWAIT)
 
 
 def _is_reply(packet: bytes, heard: bytes) -> bool:
@@ -307,10 +328,12 @@ def _explain_foreign(packet: bytes, heard: bytes) -> str:
 
 
 class ModbusClient:
-    """A blocking Modbus master on one line, for one thread. Bounded: a transaction ends within twice the time-out."""
+    """A blocking Modbus master on one line, for one thread. Bounded: a transaction ends within twice the time-out; in
+    virtual time (`clock`) not before the simulated units have nothing left to answer."""
 
-    def __init__(self, settings: BusSettings) -> None:
+    def __init__(self, settings: BusSettings, clock: Now | None = None) -> None:
         self._settings = settings
+        self._clock = clock
         self._place = parse_address(settings.address)
         self._where = get_display_address(settings.address)
         self.serial = isinstance(self._place, SerialEndpoint)
@@ -326,6 +349,7 @@ class ModbusClient:
         if self._client is not None:
             return
         client = self._make()
+        client.clock = self._clock
         client.framer.decoder = Decoder(is_server=False)
         for reply in REPLIES:
             client.register(reply)

@@ -13,7 +13,8 @@ import time
 from collections.abc import Callable
 
 from thermostand.drivers.framing.ximc import ERROR_SIZES, XimcDamage, XimcFrame, decode, encode
-from thermostand.drivers.wires.link import ByteLink
+from thermostand.drivers.wires.link import ByteLink, read_reply
+from thermostand.foundation.clock import Now, await_simulated_answers
 from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
 READ_RETRIES = 2
@@ -30,13 +31,17 @@ class XimcClient:
     """Speaks to one controller over a link made by `connect`. Not thread-safe.
 
     A broken link is closed, and opened again by the next request: while `connected` is False nobody knows who will
-    answer. `timeout_s`: real seconds for a whole reply. `errors` counts exchanges that went wrong.
+    answer. `timeout_s`: real seconds for a whole reply, in virtual time (`clock`) also until the simulated controller
+    has nothing left to answer. `errors` counts exchanges that went wrong.
     """
 
-    def __init__(self, device: str, connect: Callable[[], ByteLink], timeout_s: float = 0.25) -> None:
+    def __init__(
+        self, device: str, connect: Callable[[], ByteLink], timeout_s: float = 0.25, clock: Now | None = None
+    ) -> None:
         self._device = device
         self._connect = connect
         self._timeout_s = timeout_s
+        self._clock = clock
         self._link: ByteLink | None = None
         self._echoes: bool | None = None  # whether this link's controller echoes a zero; None when not yet known
         self.errors = 0
@@ -99,7 +104,7 @@ class XimcClient:
         time."""
         deadline_s = time.monotonic() + self._timeout_s
         frame, received, first = None, b"", b""
-        while frame is None and (data := _read_before(link, deadline_s)):
+        while frame is None and (data := read_reply(link, deadline_s, self._clock)):
             first = first or data[:1]
             frame, received = decode(received + data, {**ERROR_SIZES, letters: reply_size})
         return frame, received, first == _MARK
@@ -110,9 +115,10 @@ class XimcClient:
             link.write(_RESYNC_ZEROS)
             deadline_s = time.monotonic() + self._timeout_s
             received = b""
-            while data := _read_before(link, deadline_s):
+            while data := read_reply(link, deadline_s, self._clock):
                 received += data
                 if _RESYNC_ECHO in received:
+                    await_simulated_answers(self._clock)
                     while time.monotonic() < deadline_s and link.read(_SETTLE_S):
                         pass
                     return
@@ -131,9 +137,3 @@ class XimcClient:
         if frame.damage is XimcDamage.NONE:
             return GarbledReply(self._device, f"more came than the answer to {letters}, or an earlier answer")
         return GarbledReply(self._device, f"the answer to {letters} was {frame.letters!r} ({frame.damage.name})")
-
-
-def _read_before(link: ByteLink, deadline_s: float) -> bytes:
-    """What has arrived until time.monotonic() reaches `deadline_s`; b"" then."""
-    left_s = deadline_s - time.monotonic()
-    return link.read(left_s) if left_s > 0 else b""

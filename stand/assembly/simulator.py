@@ -174,6 +174,7 @@ class ControlSocket:
     def __init__(self, address: str) -> None:
         self._place = parse_tcp_address(address)
         self._socket: socket.socket | None = None
+        self._settling: socket.socket | None = None  # an `advance` may be under way on the other one
 
     async def open(self) -> None:
         """Connect; raises Unreachable."""
@@ -221,8 +222,27 @@ class ControlSocket:
         if line != b'{"now_ns": %d}\n' % now_ns:
             _parse_answer(line)
 
+    def settle(self) -> None:
+        """Block until the simulated devices have answered all that has arrived at them; at once when the simulator is
+        gone."""
+        try:
+            if self._settling is None:
+                self._settling = socket.create_connection(self._place, _CONNECT_S)
+                self._settling.settimeout(None)
+            self._settling.sendall(b'{"do": "settle"}\n')
+            while not self._settling.recv(65536).endswith((b"\n", b"")):
+                pass
+        except OSError:
+            self._close_settling()
+
+    def _close_settling(self) -> None:
+        if self._settling is not None:
+            self._settling.close()
+        self._settling = None
+
     async def close(self) -> None:
         """Let go; may be called twice."""
+        self._close_settling()
         if self._socket is not None:
             self._socket.close()
         self._socket = None

@@ -343,7 +343,7 @@ async def _run_virtual(job: Job, front: Front, start_ns: int) -> Path:
         control = ControlSocket(simulator.addresses["control"])
         stack.push_async_callback(control.close)
         await control.open()
-        clock = VirtualClock(start_ns, control.advance)
+        clock = VirtualClock(start_ns, control.advance, control.settle)
         remote = replace(job, order=replace(order, config=relocate(order.config, simulator.addresses)))
         return await _run(remote, front, clock, clock.run, stop)
 

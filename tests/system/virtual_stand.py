@@ -97,7 +97,7 @@ async def virtual_stand(config: StandConfig) -> AsyncGenerator[VirtualStand]:
         control = ControlSocket(simulator.addresses["control"])
         stack.push_async_callback(control.close)
         await control.open()
-        clock = VirtualClock(begin_ns, control.advance)
+        clock = VirtualClock(begin_ns, control.advance, control.settle)
         assembly = assemble(relocate(config, simulator.addresses), Hub(), clock)
         open_stand = await stack.enter_async_context(open_assembly(assembly, clock.run, stop, is_for_one=True))
         stand = VirtualStand(assembly, open_stand, control, clock, begin_ns)

@@ -125,7 +125,7 @@ def main() -> int:
     folder = Path(os.environ[FOLDER])
     spec = parse_document(sys.stdin.read(), LaboratorySpec, "laboratory")
     life, case = int(os.environ[LIFE]), read_case(folder / "case.yaml")
-    (begun := folder / f"begun-{life}").touch()
+    (begun := folder / f"begun-{life}").write_text(str(os.getpid()))
     laboratory = ObservedLaboratory(spec, folder, life)
     schedule = Breaking(laboratory, list_planned_faults(case, laboratory.now_ns, folder, life))
     control = serve_control(laboratory, schedule, ending.ask)

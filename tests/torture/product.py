@@ -16,9 +16,9 @@ import os
 import random
 import signal
 import sys
-from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import thermostand.stand.service.run as run_module
 from tests.torture.case import Case, Order, read_case
@@ -61,8 +61,8 @@ class ShuffledLoop(asyncio.SelectorEventLoop):
 class TortureClock(VirtualClock):
     """Virtual time in which somebody does things to the stand."""
 
-    def __init__(self, schedule: Schedule, start_ns: int, advance: Callable[[int], Awaitable[None]]) -> None:
-        super().__init__(start_ns, advance)
+    def __init__(self, schedule: Schedule, start_ns: int, *simulator: Any) -> None:
+        super().__init__(start_ns, *simulator)
         self._schedule, self._begun = schedule, None
         loop = asyncio.get_running_loop()
         if schedule.case.drawn_order:
@@ -174,7 +174,7 @@ def main() -> None:
         os.environ["TORTURE_BUS"] = self.addresses["bus"]
 
     Simulator.__init__ = begun
-    run_module.VirtualClock = lambda start_ns, advance: TortureClock(schedule, start_ns, advance)
+    run_module.VirtualClock = partial(TortureClock, schedule)
     if case.drawn_order:
         ShuffledLoop.seed = case.seed
         asyncio.events.new_event_loop = asyncio.runners.events.new_event_loop = ShuffledLoop

@@ -44,7 +44,7 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
     place = folder or Path(tempfile.mkdtemp(prefix="torture-"))
     try:
         begun, lives = live_real(case, place) if case.is_real else (case, live(case, place))
-        left = _compute_digests(place)  # before the evidence, for which what is unfinished is salvaged
+        left = compute_digests(place)  # before the evidence, for which what is unfinished is salvaged
         evidence = (RealEvidence if case.is_real else Evidence)(begun, place, lives)
         spans_ns = [int(each["time_ns"][-1] - each["time_ns"][0]) for each in evidence.truth if len(each)]
         events = Counter(event.kind for event in evidence.events)
@@ -62,13 +62,13 @@ def perform(case: Case, folder: Path | None = None, *, twice: bool = False) -> R
 
 def _find_differences(case: Case, folder: Path, first: dict[str, str]) -> Iterator[Violation]:
     live(case, folder)
-    second = _compute_digests(folder)
+    second = compute_digests(folder)
     differing = sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
     if differing:
         yield Violation("is_the_same_twice", f"not the same twice: {', '.join(differing[:6])}", len(differing))
 
 
-def _compute_digests(folder: Path) -> dict[str, str]:
+def compute_digests(folder: Path) -> dict[str, str]:
     """Of the session's files."""
     files = [path for path in folder.glob("out/*/**/*") if path.is_file()]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

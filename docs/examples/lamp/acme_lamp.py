@@ -36,7 +36,7 @@ class Lamp:
         self.identity: Identity | None = None
         self._clock = clock
         self._lane: WorkerThread | None = None
-        self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0))
+        self._client = LineClient.at(name, settings.address, SerialSettings(9600, 1), (1.0, 0.0), clock=clock)
 
     async def _ask(self, text: str) -> str:
         def whole(data: bytes) -> str | None:

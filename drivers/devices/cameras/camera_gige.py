@@ -20,7 +20,7 @@ from thermostand.drivers.wires.camera_settings import (
     significant_bits,
 )
 from thermostand.drivers.wires.frame_count import FrameCount
-from thermostand.foundation.clock import Clock, to_ns
+from thermostand.foundation.clock import Clock, VirtualClock, to_ns
 from thermostand.foundation.errors import DeviceError, Unreachable
 from thermostand.foundation.readings import Frame, Reading, bad_reading
 from thermostand.foundation.workers import Result, WorkerThread
@@ -82,7 +82,7 @@ class AravisCamera:
         """
         if self._lane is None:
             self._lane = WorkerThread(self._name, self._clock)
-        await self._call(self._connect)
+        await self._perform(self._connect)
         self._has_opened = True
         self.restarted = self._explain_restart(self._require_connection().clock_began_ns)
         self._heard_ns = self._clock.now_ns()
@@ -179,6 +179,13 @@ class AravisCamera:
         raise self._lose(f"{ATTEMPTS} frame periods brought no complete frame")
 
     async def _call(self, function: Callable[..., Result], *args: object) -> Result:
+        """Ask something of the camera that is connected; Unreachable when it has lost us."""
+        if isinstance(self._clock, VirtualClock):
+            await self._perform(self._require_connection().check_control)
+            self._require_connection()
+        return await self._perform(function, *args)
+
+    async def _perform(self, function: Callable[..., Result], *args: object) -> Result:
         """Call in the worker thread; what Aravis reports leaves as a DeviceError."""
         if self._lane is None:
             raise Unreachable(self._name, "not open")

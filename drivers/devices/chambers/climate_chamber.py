@@ -74,6 +74,7 @@ class ClimateChamber:
         module = next(language for language in LANGUAGES.values() if type(settings) is language.Settings)
         gap_s = compute_call_pause_s(clock, settings.gap_s)
         self._language = module.Language(name, settings.model_copy(update={"gap_s": gap_s}))
+        self._language.client.clock = clock
         self.dead_man = self._language.dead_man
         self._worker: WorkerThread | None = None
         self._exclusive = Exclusive()

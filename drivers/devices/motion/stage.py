@@ -133,7 +133,7 @@ class Axis:
         self.profile = settings.stage
         self._clock = clock
         self._worker: WorkerThread | None = None
-        self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE))
+        self._client = XimcClient(name, lambda: open_link(name, settings.address, _LINE), clock=clock)
         self._speed_steps_s = 1000.0
         self._changed = ""  # what of the controller's settings is not as delivered
         self._motion = MotionArbiter(name)
