@@ -29,7 +29,8 @@ from mcap.writer import CompressionType
 
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import sync_folder
-from thermostand.recording.format.images import ZSTD_LEVEL
+from thermostand.recording.format.damage import DAMAGE
+from thermostand.recording.format.images import IMAGE_SCHEMA, META_SCHEMA, ZSTD_LEVEL
 from thermostand.recording.format.inventory import SegmentState, explain_changed_names, list_segments
 from thermostand.recording.format.layout import (
     DAMAGED,
@@ -46,9 +47,16 @@ from thermostand.recording.format.layout import (
 from thermostand.recording.format.manifest import MANIFEST_NAME, Manifest, Sealed, read_manifest
 from thermostand.recording.format.mcap_bytes import Source
 from thermostand.recording.format.mcap_contents import McapContents
+from thermostand.recording.format.messages import decode_frame_meta
 from thermostand.recording.format.records import find_strangers
 from thermostand.recording.reading.segment_check import check_segment, judge_rewritten
-from thermostand.recording.reading.segment_scan import SegmentScan, StoredMessage, read_stored_messages, scan_segment
+from thermostand.recording.reading.segment_scan import (
+    SegmentScan,
+    Span,
+    StoredMessage,
+    read_stored_messages,
+    scan_segment,
+)
 from thermostand.recording.writing.locks import lock
 from thermostand.recording.writing.manifest_file import complete_manifest
 from thermostand.recording.writing.mcap_writer import McapWriter
@@ -385,6 +393,37 @@ class _Original:
         return self.path != self.finished and not self.found.damages and not self.unknown
 
 
+def _examine(path: Path, finished: Path, source: Source, report: Callable[[int], None]) -> _Original:
+    found = scan_segment(source, report=report)
+    opening = find_opening(path, found)
+    if opening is not None and path.parent.name == FRAMES:
+        _forget_foreign_chunks(source, found, opening)
+    return _Original(path, finished, source, found, opening)
+
+
+def _forget_foreign_chunks(source: Source, found: SegmentScan, opening: SegmentOpening) -> None:
+    """A sound chunk that is not a frame is of another series: a disk has written its sector to the wrong place."""
+    for place in tuple(found.chunks):
+        messages = list(read_stored_messages(source, place))
+        if all(opening.knows(each.channel) for each in messages) and not _is_frame(messages, opening):
+            found.chunks.remove(place)
+            found.messages -= Counter(each.channel for each in messages)
+            found.damages.append(Span(place.offset, place.offset + place.length))
+    found.damages.sort()
+
+
+def _is_frame(messages: list[StoredMessage], opening: SegmentOpening) -> bool:
+    """Whether they are a description and its image."""
+    names = [opening.schemas[opening.channels[each.channel].schema_id].name for each in messages]
+    if names != [META_SCHEMA, IMAGE_SCHEMA]:
+        return False
+    try:
+        time_ns = decode_frame_meta(messages[0].data).time_ns
+    except (SessionError, *DAMAGE):
+        return False
+    return all(each.log_time_ns == time_ns for each in messages)
+
+
 def _salvage_segment(path: Path, share: ShareProgress) -> Salvaged:
     """One segment; SessionError when the disk refuses."""
     finished = path.with_name(f"{path.name.partition('.')[0]}{FINISHED}")
@@ -392,8 +431,7 @@ def _salvage_segment(path: Path, share: ShareProgress) -> Salvaged:
         if fd is None:
             return Salvaged(path, None, 0, 0, BEING_RECORDED, None)
         source = Source(fd)
-        found = scan_segment(source, report=share.within(path))
-        original = _Original(path, finished, source, found, find_opening(path, found))
+        original = _examine(path, finished, source, share.within(path))
         if path != finished and finished.exists():
             return _salvage_unfinished_pair(original)
         return _salvage_alone(original)
@@ -417,8 +455,7 @@ def _salvage_unfinished_pair(part: _Original) -> Salvaged:
     """An unfinished segment whose finished one is there, too, and sound: whichever holds all the messages of both."""
     with part.finished.open("rb") as file:
         source = Source(file.fileno())
-        found = scan_segment(source)
-        finished = _Original(part.finished, part.finished, source, found, find_opening(part.finished, found))
+        finished = _examine(part.finished, part.finished, source, lambda read_bytes: None)
         ours, theirs = _count_digests(part), _count_digests(finished)
     if ours <= theirs:
         return _settle(part, part.finished)

@@ -23,7 +23,7 @@ from thermostand.markers.detection import DetectionError
 from thermostand.markers.image_file import read_image
 from thermostand.recording.format.images import decode_image
 
-LIMIT_S = 120
+LIMIT_S = 600  # of a program that hangs; the slowest takes half a minute on a quiet machine
 MOST_BYTES = 1_500_000_000
 
 

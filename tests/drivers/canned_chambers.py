@@ -59,7 +59,8 @@ def _language(frames: Sequence[bytes], answer: Asked, truth: Asked, refusals: fr
             with suppress(GarbledReply, Unreachable, Refused):
                 found = client.send(b"?", lambda heard: answer(number, heard))
                 half = wire[: len(wire) // 2]
-                assert found in [truth(number, heard) for heard in (half, wire)], found
+                # Flow control behind the end of a reply is no part of it.
+                assert found in [truth(number, heard.rstrip(b"\x11\x13")) for heard in (half, wire)], found
                 return True
             return False
 

@@ -64,6 +64,21 @@ def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, intact, earlier, 
         assert read_segment(done.path) == written.untouched(data), f"{begin} to {to}"
 
 
+@pytest.mark.parametrize("trials", TRIALS)
+def test_a_sector_of_telemetry_adds_nothing_to_a_segment_of_frames(damaged, night, trials):
+    """Its chunks have right CRCs, and channels of the same numbers."""
+    rng, source = random.Random("telemetry in frames"), night[1][TELEMETRY, "finished"].data
+    size = len(night[1][FRAMES, "part"].data)
+    for _ in range(trials):
+        begin, to = (rng.randrange(4096, end - 4096, 4096) for end in (len(source), size))
+        sector = source[begin : begin + 4096]
+        folder, path, written = damaged(FRAMES, lambda data, at=to, new=sector: data[:at] + new + data[at + len(new) :])
+        data = path.read_bytes()
+        (done,) = salvage_session(folder.parent)
+        assert read_segment(done.path) == written.untouched(data), f"{begin} to {to}"
+        assert done.kept is not None
+
+
 @pytest.mark.parametrize("trials", [8, mark_nightly(300)])
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("series", SERIES)
