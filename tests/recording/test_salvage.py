@@ -65,10 +65,10 @@ def test_a_sector_that_belongs_elsewhere_adds_nothing(damaged, intact, earlier, 
 
 
 @pytest.mark.parametrize("trials", TRIALS)
-def test_a_sector_of_telemetry_adds_nothing_to_a_segment_of_frames(damaged, night, trials):
+def test_a_sector_of_telemetry_adds_nothing_to_a_segment_of_frames(damaged, intact, trials):
     """Its chunks have right CRCs, and channels of the same numbers."""
-    rng, source = random.Random("telemetry in frames"), night[1][TELEMETRY, "finished"].data
-    size = len(night[1][FRAMES, "part"].data)
+    rng, source = random.Random("telemetry in frames"), intact[1][TELEMETRY, "finished"].data
+    size = len(intact[1][FRAMES, "part"].data)
     for _ in range(trials):
         begin, to = (rng.randrange(4096, end - 4096, 4096) for end in (len(source), size))
         sector = source[begin : begin + 4096]

@@ -28,7 +28,7 @@ def test_a_case_breaks_no_invariant(path: Path):
 
 BUSY = Case(
     4,
-    {**PLAIN, "beside": "imager, inputs, probes"},
+    {**PLAIN, "extras": "imager, inputs, probes"},
     {
         "steps": [
             "close_flap",

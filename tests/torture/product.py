@@ -91,7 +91,13 @@ class Disk:
             synced(file)
 
         os.fdatasync = sync
-        notices.read_disk_space = lambda folder: space(folder)._replace(**({"free_bytes": 0} if self.is_full else {}))
+        notices.read_disk_space = self._read_space
+        self._read_host_space = space
+
+    def _read_space(self, folder: Path) -> notices.Space:
+        """Full or empty: how full the host's is adds nothing to what is recorded."""
+        space = self._read_host_space(folder)
+        return space._replace(free_bytes=0 if self.is_full else space.total_bytes)
 
 
 class Schedule:
