@@ -418,7 +418,7 @@ def _is_frame(messages: list[StoredMessage], opening: SegmentOpening) -> bool:
     if names != [META_SCHEMA, IMAGE_SCHEMA]:
         return False
     try:
-        time_ns = decode_frame_meta(messages[0].data).time_ns
+        time_ns = decode_frame_meta(bytes(messages[0].data)).time_ns
     except (SessionError, *DAMAGE):
         return False
     return all(each.log_time_ns == time_ns for each in messages)
