@@ -43,6 +43,7 @@ LINE_LIMIT_BYTES = 1 << 14
 MOST_CLIENTS = 16
 _MOST_WAITING = 64  # requests of a client
 _MOST_UNREAD_BYTES = 1 << 20  # some minutes of all values
+_SEND_LIMIT_S = 10.0
 _LOOK_S = 0.1
 _SPEAK_WITHIN_S = 10.0  # the first request
 _FAREWELL_S = 1.0
@@ -151,6 +152,7 @@ class Node:
         self._bridge, self._read_only = bridge, read_only
         self._reported: dict[Place, tuple[Report, float]] = {}  # as clients know it, since when: s since the epoch, UTC
         self._clients: dict[_Client, asyncio.Task[None]] = {}
+        self._seen = bridge.snapshot
         self._look()
 
     async def serve(self, listening: socket.socket) -> None:
@@ -159,7 +161,8 @@ class Node:
         try:
             while True:
                 try:
-                    self._look()
+                    if self._bridge.snapshot is not self._seen or self._seen.age_s > 1.0:
+                        self._look()
                 except Exception as error:  # noqa: BLE001 - what one value is must not end the door
                     self.failed(error)
                 await asyncio.sleep(_LOOK_S)
@@ -182,7 +185,8 @@ class Node:
 
     def _look(self) -> None:
         """Tell clients what is not as it was at the last look."""
-        state, is_old = self._bridge.snapshot.state, self._bridge.snapshot.age_s > _OLD_S
+        self._seen = self._bridge.snapshot
+        state, is_old = self._seen.state, self._seen.age_s > _OLD_S
         for name, module in self.modules.items():
             if module.drive is not None:
                 module.drive.look(state)
@@ -197,9 +201,10 @@ class Node:
                         client.say(self._make_line("update", "error_update", place))
 
     async def _refresh_state(self) -> StandState:
-        state = (await self._bridge.get_fresh_snapshot()).state
-        self._look()
-        return state
+        snapshot = await self._bridge.get_fresh_snapshot()
+        if snapshot is not self._seen:
+            self._look()
+        return snapshot.state
 
     def _make_line(self, word: str, error_word: str, place: Place, specifier: str = "") -> bytes:
         """The line that tells a parameter's value, or why there is none."""
@@ -303,12 +308,19 @@ class Node:
             given = None if argument is None else argument.model_validate(fields)
         except ValidationError as error:
             raise Refusal("RangeError", error.errors()[0]["msg"]) from error
-        came = await self._perform(self._bridge.perform(name, WHO, given))
-        if module.drive is not None:
+        if (drive := module.drive) is None:
+            came = await self._perform(self._bridge.perform(name, WHO, given))
+            await self._refresh_state()
+            return came.id if isinstance(came, QueuedRun) else None
+        drive.is_ordering = True
+        try:
+            await self._perform(self._bridge.perform(name, WHO, given))
             now_ns = (await self._bridge.get_fresh_snapshot()).state.now_ns
-            module.drive.order(target, began_ns if module.drive.is_read_after else now_ns)
-        await self._refresh_state()
-        return came.id if isinstance(came, QueuedRun) else None
+            drive.order(target, began_ns if drive.is_read_after else now_ns)
+        finally:
+            drive.is_ordering = False
+        self._look()
+        return None
 
     async def _perform(self, work: Awaitable[BaseModel]) -> BaseModel:
         """Do it; Refusal of SECoP's class. What a device reported is the cause of a Conflict."""
@@ -343,8 +355,9 @@ class _Client:
         self._order = asyncio.Lock()  # whose waiters have their turn in the order of coming
 
     def say(self, line: bytes) -> None:
-        """Send a line; who does not read leaves."""
-        self._writer.write(line)
+        """Send a line, whether or not it reads."""
+        if not self._writer.is_closing():
+            self._writer.write(line)
         if self._writer.transport.get_write_buffer_size() > _MOST_UNREAD_BYTES:
             self._writer.transport.abort()
 
@@ -402,6 +415,11 @@ class _Client:
             except Exception as error:  # noqa: BLE001 - the stand's events say more, and nobody else is concerned
                 self._node.failed(error)
                 self._refuse(request, Refusal("InternalError", f"failed ({type(error).__name__})"))
+            try:
+                async with asyncio.timeout(_SEND_LIMIT_S):
+                    await self._writer.drain()
+            except OSError:  # gone, or it does not read
+                self._writer.transport.abort()
 
     def _refuse(self, request: SecopRequest, refusal: Refusal) -> None:
         action, content = f"error_{request.action[:200]}", [refusal.error, refusal.text, {}]

@@ -18,6 +18,7 @@ DataInfo = dict[str, Any]
 Order = tuple[str, dict[str, JsonValue]]  # a command of the stand's service, and the fields of its argument
 Read = Callable[[StandState], ReadingState | JsonValue]
 GetStatus = Callable[[StandState], tuple[int, str]]
+_PLACED_BY = {"set": ("pv", "sp"), "move": ("position", "position")}  # by a verb: the channels of value and target
 _OWN_NAMES = {STOP: "stop", "reset": "clear_errors"}  # that SECoP has itself; all others get an underscore
 
 # SECoP's data types, as far as this node has them.
@@ -85,6 +86,7 @@ class Drive:
     def __init__(self, device: str, channel: str = "", *, is_read_after: bool = False) -> None:
         self.device, self.channel, self.is_read_after = device, channel, is_read_after
         self.target: JsonValue = None
+        self.is_ordering = False  # an order of this node is on its way
         self._busy_ns, self._is_ours = -1, False
 
     def order(self, target: JsonValue, now_ns: int) -> None:
@@ -102,7 +104,8 @@ class Drive:
     def is_busy(self, state: StandState) -> bool:
         """Until it has been read after the end of its order: who waits for the end reads where it is, not was."""
         reading = state.readings.get(self.channel)
-        return (-1 if reading is None else reading.time_ns) <= self._busy_ns if self.channel else False
+        read_ns = state.now_ns if not self.channel else -1 if reading is None else reading.time_ns
+        return self.is_ordering or read_ns <= self._busy_ns
 
 
 class Module(NamedTuple):
@@ -144,10 +147,10 @@ def make_modules(
 
 
 def _make_device_modules(device: DeviceState, readings: Mapping[str, ReadingState]) -> Iterator[tuple[str, Module]]:
-    to_place = next((each for each in device.verbs if len(each.arguments) == 1), None)
+    to_place = next((each for each in device.verbs if each.verb in _PLACED_BY), None)
     if device.kind == "flap":
         yield device.name, _make_flap(device.name)
-    elif to_place is not None and device.channels:
+    elif to_place is not None:
         yield "chamber" if device.kind == "regulator" else device.name, _make_drive(device, to_place, readings)
     else:
         for channel in device.channels:
@@ -160,10 +163,10 @@ def _make_device_modules(device: DeviceState, readings: Mapping[str, ReadingStat
 
 
 def _make_drive(device: DeviceState, to_place: DeviceVerb, readings: Mapping[str, ReadingState]) -> Module:
-    """A device of which a verb takes one number: the chamber, or a stage."""
+    """The chamber, or a stage."""
     is_chamber = device.kind == "regulator"
-    name, channel, given = device.name, device.channels[0], to_place.arguments[0]
-    set_point = f"{name}.sp" if is_chamber else channel
+    name, given = device.name, to_place.arguments[0]
+    channel, set_point = (f"{name}.{each}" for each in _PLACED_BY[to_place.verb])
     drive = Drive(name, set_point, is_read_after=not is_chamber)
     unit = readings[channel].unit if channel in readings else given.unit
     limits = {"min": given.minimum, "max": given.maximum}

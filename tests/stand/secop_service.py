@@ -24,6 +24,7 @@ from thermostand.stand.serving.secop import make_secop_listener
 
 AT = Argument(name="position", unit="mm", minimum=0, maximum=280)
 WARM = Argument(name="setpoint_degC", unit="degC", minimum=-10, maximum=60)
+FOR = Argument(name="exposure_s", unit="s", minimum=0, maximum=10)
 PLAIN = tuple[str, ...]
 
 
@@ -86,7 +87,7 @@ class SecopService(FakeService):
             _device("thermometers", "thermometers", thermometers),
             _device("flap", "flap", ("flap.position",), _verb("open"), _verb("close")),
             _device("linear", "axis", ("linear.position",), _verb("move", AT), _verb("stop"), _verb("home")),
-            _device("camera", "camera", ("camera.temperature",), _verb("on"), _verb("off")),
+            _device("camera", "camera", ("camera.temperature",), _verb("on"), _verb("off"), _verb("frame", FOR)),
         )
 
     async def device(self, who: Who, given: DeviceRequest) -> str:

@@ -3,15 +3,23 @@
 import asyncio
 import json
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.stand.secop_service import JAM, NO, WIRE, SecopService, node
 from tests.stand.secop_talk import talking
+from thermostand.foundation.readings import Quality
+from thermostand.stand.assembly.assemble import load_unit_map
+from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.safety.gate import INTERLOCK
-from thermostand.stand.serving.api_models import FaultState, HeatByHand
+from thermostand.stand.service.bench import GRAB, READ, REGISTERS, list_devices
+from thermostand.stand.service.stand_service import StandService
+from thermostand.stand.serving.api_models import FaultState, HeatByHand, ReadingState
+from thermostand.stand.serving.commands import collect_commands
 from thermostand.stand.serving.secop import SecopRequest, make_message, parse_request
+from thermostand.stand.serving.secop_modules import make_modules
 
 
 @pytest.mark.parametrize(
@@ -65,6 +73,37 @@ async def test_identification_description_and_heartbeat(tmp_path: Path):
         assert abs(qualifiers["t"] - time.time()) < 5  # noqa: TID251 - the host's clock is what it must be
         assert (await talk.ask("ping")).startswith("pong  [null")
         assert (await talk.ask("help")).startswith('helping  "')
+
+
+async def test_each_device_of_an_installed_stand_is_operated_by_what_it_takes_and_read_by_its_channels():
+    config = load_config(find_packaged("", "simulated"))
+    devices = tuple(
+        each.model_copy(update={"verbs": tuple(v for v in each.verbs if v.verb not in (READ, REGISTERS, GRAB))})
+        for each in list_devices(config)
+    )
+    channels = [
+        (f"{each.name}.{channel.name}", channel.unit)
+        for each in config.equipment
+        for channel in each.channels(partial(getattr, config), load_unit_map)
+    ]
+    readings = {name: ReadingState(value=1.0, unit=unit, quality=Quality.GOOD, time_ns=1) for name, unit in channels}
+    named = [
+        each.model_copy(update={"channels": tuple(name for name in readings if name.startswith(f"{each.name}."))})
+        for each in devices
+    ]
+    modules = make_modules(named, readings, collect_commands(StandService))
+    driven = {name: each.parameters["target"].info for name, each in modules.items() if each.drive is not None}
+    limits = {"type": "double", "unit": "degC", **dict(zip(("min", "max"), config.limits.chamber_degC, strict=True))}
+    assert driven["chamber"] == limits
+    assert driven.keys() == {"chamber", "flap", *config.axes}
+    read = {name for name, each in modules.items() if each.drive is None}
+    skipped = ("regulator.", "flap.", *(f"{name}." for name in config.axes))
+    degC = {name for name, unit in channels if unit == "degC" and not name.startswith(skipped)}
+    assert read == {name.replace(".", "_") for name in degC} | {"run"}
+    assert "camera_temperature" in read
+    assert {"stop", "clear_errors", "_pause", "_continue", "_submit", "_skip", "_cancel", "_resume"} <= set(
+        modules["run"].commands
+    )
 
 
 async def test_what_is_read_has_its_time_and_what_is_no_measurement_is_an_error(tmp_path: Path):

@@ -76,7 +76,8 @@ async def test_one_more_is_admitted_and_strangers_leave_first(tmp_path: Path, mo
     assert [verb for _, verb, _ in desk.orders] == ["stop"]
 
 
-async def test_who_does_not_read_keeps_little_and_is_left(tmp_path: Path):
+async def test_who_does_not_read_keeps_little_and_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(secop, "_SEND_LIMIT_S", 0.3)
     desk = SecopService()
     async with node(desk, tmp_path) as port, talking(port) as talk, talking(port) as other:
         talk.writer.transport.pause_reading()  # type: ignore[attr-defined]
