@@ -14,9 +14,10 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from thermostand.compensation import drift_runtime
+from thermostand.compensation.drift.claims import BetweenSessions
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.paper_model import PaperModel, list_exponents
-from thermostand.compensation.drift.thermal_model import BetweenSessions, ThermalModel
+from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.expression import CAMERA, Feature, format_c
 from thermostand.compensation.history.thermal_history import Float
 from thermostand.foundation.errors import ConfigError

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermostand.compensation.drift.candidates import FEWEST_BETWEEN
+from thermostand.compensation.drift.claims import Claims
 from thermostand.compensation.drift.terms import compute_features
 from thermostand.compensation.drift.thermal_fit import fit_thermal
 from thermostand.compensation.drift.thermal_model import ThermalModel
@@ -418,7 +419,7 @@ def _has_few_interior_set_points(observations: Observations) -> bool:
 
 
 def _predict_without_discrepancy_px(model: ThermalModel, asked: ForecastState) -> float:
-    return predict_residual_px(replace(model, discrepancy_px=np.zeros(2)), asked)
+    return predict_residual_px(replace(model, claims=Claims()), asked)
 
 
 def _list_fitted_set_points(observations: Observations) -> Float:

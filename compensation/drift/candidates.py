@@ -100,10 +100,10 @@ def compute_discrepancy_px(rows: Displacements, held_out: Float) -> Float:
     """
     inner = find_interior(rows.chamber_degC)
     squares = average_folds(rows.where(inner), (held_out**2 - rows.variance_px2)[inner])
-    return _compute_student_factor(len(squares)) * np.sqrt(np.maximum(squares.mean(axis=0), 0))
+    return compute_student_factor(len(squares)) * np.sqrt(np.maximum(squares.mean(axis=0), 0))
 
 
-def _compute_student_factor(folds: int) -> float:
+def compute_student_factor(folds: int) -> float:
     """The 95 % quantile of Student's t over that of the normal distribution (Cornish-Fisher, third order, 3 % off at 2
     degrees of freedom, 1 % at 3)."""
     freedom, z = max(folds - 1, 2), 1.959964

@@ -16,12 +16,13 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, TypeAdapter
 
 from thermostand.compensation.drift.candidates import Candidate, Pair
+from thermostand.compensation.drift.claims import BetweenSessions, Claims, Question
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.hull import is_area
 from thermostand.compensation.drift.model_facts import Bump, ModelFacts
 from thermostand.compensation.drift.paper_model import MAX_DEGREE, DegreeScore, PaperModel, list_exponents
 from thermostand.compensation.drift.terms import MOTIONS, Term, parse_term
-from thermostand.compensation.drift.thermal_model import BetweenSessions, ThermalModel, ThermalRange
+from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange
 from thermostand.compensation.drift_runtime import HOTTEST_degC
 from thermostand.compensation.value_checks import (
     Degrees,
@@ -101,7 +102,10 @@ _Term = Annotated[Term, BeforeValidator(parse_term), PlainSerializer(_serialise_
 class ThermalFile(_File):
     """The thermal form. coefficient_covariance_px2 (8 H, H): of each motion one below the other. least_on_s: null when
     the camera was never switched on within the record. between_sessions_px: one standard deviation of what a session
-    that was not fitted adds, null where that is not known; with sessions_compared 0 it was assumed, not measured."""
+    that was not fitted adds, null where that is not known; with sessions_compared 0 it was assumed, not measured.
+    claim_factors: what the covariance is multiplied by in a session that was fitted, in another one, of a camera in its
+    first hour with and without a warm-up that was fitted, and beyond the calibrated temperatures; claim_least_px: the
+    least uncertainty, along I and J."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[_Term, ...]
@@ -118,6 +122,8 @@ class ThermalFile(_File):
     history_s: NotNegative
     between_sessions_px: Spread | None
     sessions_compared: Annotated[int, Field(ge=0)]
+    claim_factors: Annotated[tuple[NotNegative, ...], Field(min_length=len(Question), max_length=len(Question))]
+    claim_least_px: Spread
     other: PaperFile | None = None
 
 
@@ -196,6 +202,8 @@ def _list_thermal_fields(model: ThermalModel) -> dict[str, object]:
         "history_s": model.history_s,
         "between_sessions_px": None if model.between_sessions is None else model.between_sessions.sigma_px,
         "sessions_compared": 0 if model.between_sessions is None else model.between_sessions.sessions,
+        "claim_factors": model.claims.factors,
+        "claim_least_px": model.claims.least_px,
     }
 
 
@@ -259,6 +267,7 @@ def _build_thermal_model(file: ThermalFile) -> ThermalModel:
         between_sessions=None
         if file.between_sessions_px is None
         else BetweenSessions(file.between_sessions_px, file.sessions_compared),
+        claims=Claims(file.claim_factors, file.claim_least_px),
     )
 
 

@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermostand.compensation.drift.candidates import Pair
+from thermostand.compensation.drift.candidates import Pair, make_pair
+from thermostand.compensation.drift.claims import Claims, Question
 from thermostand.compensation.drift.displacements import Displacements, compute_displacements_from
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import check_same
@@ -76,6 +77,7 @@ def fit_like(observations: Observations, units: Sequence[ThermalModel]) -> Therm
         ),
         has_warm_up=all(one.has_warm_up for one in units),
         candidates=(),
+        claims=Claims(least_px=make_pair(np.sqrt(discrepancy_px2))),
     )
 
 
@@ -85,7 +87,7 @@ def _pool_coefficients(units: Sequence[ThermalModel]) -> tuple[Float, Float]:
     mean, count = each.mean(axis=0), len(each)
     scatter = np.einsum("kmg,kmh->mgh", each - mean, each - mean) * (1 + 1 / count) / (count - 1)
     apart = np.einsum("mgg,gh->mgh", scatter, np.eye(scatter.shape[1]))
-    uncertain = np.mean([one.coefficient_covariance for one in units], axis=0)
+    uncertain = np.mean([one.claims.factors[Question.ANOTHER] * one.coefficient_covariance for one in units], axis=0)
     return mean, (1 - _APART) * scatter + _APART * apart + uncertain
 
 
@@ -187,4 +189,9 @@ def _condition_on_reference(
         own -= np.outer(gain, toward)
     ids = dict.fromkeys((*model.facts.session_ids, *(one.session_id for one in observations.sessions)))
     facts = replace(model.facts, session_ids=tuple(ids))
-    return replace(model, facts=facts, coefficients=coefficients, coefficient_covariance=covariance, other=None)
+    # The session is seen in one state only: elsewhere the model is asked as in any other session.
+    factors = model.claims.factors
+    claims = replace(model.claims, factors=(factors[Question.ANOTHER], *factors[1:]))
+    return replace(
+        model, facts=facts, coefficients=coefficients, coefficient_covariance=covariance, claims=claims, other=None
+    )

@@ -15,20 +15,17 @@ from scipy.optimize import minimize
 
 from thermostand.compensation.drift.candidates import (
     Candidate,
+    Pair,
     average_folds,
     compute_discrepancy_px,
     compute_moving_rms_px,
     make_pair,
 )
+from thermostand.compensation.drift.claims import BetweenSessions, Claims, Question, estimate_claims
 from thermostand.compensation.drift.displacements import Displacements
 from thermostand.compensation.drift.model_facts import collect_facts
 from thermostand.compensation.drift.terms import MOTIONS, Term, build_state_spec, compute_motions, list_usual_terms
-from thermostand.compensation.drift.thermal_model import (
-    ThermalModel,
-    ThermalRange,
-    estimate_between_sessions,
-    format_form_name,
-)
+from thermostand.compensation.drift.thermal_model import ThermalModel, ThermalRange, format_form_name
 from thermostand.compensation.drift.training_data import (
     Index,
     Instants,
@@ -48,10 +45,6 @@ _OU_NOISES, _OU_TIME_CONSTANTS_S = (1.0, 2.0, 4.0), (1800.0, 7200.0)
 """Standard deviation of the wander over that of an instant's noise."""
 _PRIOR_LOG_WIDTH, _PRIOR_LOG_SIGMA = math.log(20.0), 3.0
 """A coefficient is expected to be 20 times the noise, within a factor of e^3: a weak prior on the widths."""
-# With it 95 and 92 % of all answers hold on two sets of drawn cameras, without it 82 and 81 %.
-_COVARIANCE_INFLATION = 1.25
-"""One session shows states in one order only, and its most likely widths and terms are taken for the true ones: in
-other sessions answers are off by this much more than their posterior says (24 drawn cameras)."""
 _LOG_WIDTH_LIMITS, _LOG_NOISE_LIMITS = (math.log(1e-3), math.log(1e4)), (0.0, math.log(1e4))
 # A bound only: the optimiser's own criteria end it.
 _ROUNDS = 60
@@ -98,24 +91,18 @@ class Posterior:
     _scale_px: Float
     _hyperparameters: tuple[_Hyperparameters, ...]
 
-    def fit_without(self, left_out: NDArray[np.bool_]) -> Float:
-        """(8, H): what the instants teach without some of them (I,), with the same prior and noise."""
-        found = np.empty_like(self.coefficients)
+    def fit_without(self, left_out: NDArray[np.bool_]) -> tuple[Float, Float]:
+        """Coefficients (8, H), px, and their covariance (8, H, H), px^2: what the instants teach without some of them
+        (I,), with the same prior and noise."""
+        coefficients, covariance = np.empty_like(self.coefficients), np.empty_like(self.covariance)
         rows = np.flatnonzero(left_out)
         amounts = self.instants.amounts_px / self._scale_px
         for motion, own in enumerate(self._hyperparameters):
             known = _build_normal_equations(self.instants.features, amounts, own.weighting, rows)
-            found[motion] = _solve(known, motion, own)[0] * self._scale_px[motion]
-        return found
-
-    def compute_jackknife_covariance(self, fold: Float) -> Float:
-        """(8, H, H), px^2: how much the coefficients hang on any one of the folds (I,), NaN in none; the jackknife's
-        variance (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11). What no term explains, a
-        dead zone of a part that nobody measures, pulls each of them its own way, and the posterior knows nothing of it.
-        """
-        each = np.array([self.fit_without(fold == value) for value in np.unique(fold[np.isfinite(fold)])])
-        away = each - each.mean(axis=0)
-        return np.einsum("kmg,kmh->mgh", away, away) * (len(each) - 1) / len(each)
+            found, uncertain = _solve(known, motion, own)
+            coefficients[motion] = found * self._scale_px[motion]
+            covariance[motion] = uncertain * self._scale_px[motion] ** 2
+        return coefficients, covariance
 
 
 def fit_posterior(instants: Instants, terms: Sequence[Term]) -> Posterior:
@@ -143,7 +130,7 @@ def fit_posterior(instants: Instants, terms: Sequence[Term]) -> Posterior:
     return Posterior(
         instants,
         np.array([coefficients for coefficients, _ in solved]) * scale_px[:, None],
-        np.array([covariance for _, covariance in solved]) * (_COVARIANCE_INFLATION * scale_px[:, None, None]) ** 2,
+        np.array([covariance for _, covariance in solved]) * scale_px[:, None, None] ** 2,
         np.array([(own.noise * own.weighting.ou_noise) ** 2 for own in believed]) * scale_px**2,
         scale_px,
         believed,
@@ -216,22 +203,19 @@ _INITIAL_ERROR_K = 5.0
 # Of the complex-step derivative: the smaller the better, since nothing is subtracted.
 _TINY = 1e-20
 _LEAST_PX, _STEP_S = 0.003, 300.0
-# Without it 90, 91 and 93 % of the unflagged intervals hold on other sessions of the 48 judged cameras (switching on,
-# small steps, jumps), with it 92, 96 and 96. The interval's own part grows with the root: by 1.4 for twice as much.
-_JACKKNIFE_WEIGHT = 4.0
-"""The jackknife over the set-points of one session sees a part of what another session brings: its variance counts so
-many times. Chosen on 48 drawn cameras, judged on 48 others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ThermalFit:
-    """What was learned from. rows: of the frames at set-points; held_out (M, 2): their residuals, px, each from what
-    the others teach. moving (M, 2): such residuals of frames that were not at rest."""
+    """What was learned from. rows: of the frames at set-points; held_out, predicted_px2 (M, 2): their residuals, px,
+    each from what the others teach, and the variance of these by that. moving (M, 2): such residuals of frames that
+    were not at rest."""
 
     trained: Training
     learned: Posterior
     rows: Displacements
     held_out: Float
+    predicted_px2: Float
     moving: Float
 
 
@@ -258,34 +242,47 @@ def _fit_training(trained: Training) -> _ThermalFit:
         )
     learned = fit_posterior(instants, trained.terms)
     rows, moving = trained.fold_rows.where(trained.at_rest), trained.moving_rows
-    held_out = _compute_held_out_residuals(trained, learned, rows, instants.chamber_degC, rows.chamber_degC)
+    left = _compute_held_out_residuals(trained, learned, rows, instants.chamber_degC, rows.chamber_degC)
     folds = trained.assign_folds(instants.frame), trained.assign_folds(moving.frame)
-    return _ThermalFit(trained, learned, rows, held_out, _compute_held_out_residuals(trained, learned, moving, *folds))
+    return _ThermalFit(trained, learned, rows, *left, _compute_held_out_residuals(trained, learned, moving, *folds)[0])
 
 
 def _compute_held_out_residuals(
     trained: Training, learned: Posterior, rows: Displacements, of_instant: NDArray[np.float64], of_row: Float
-) -> Float:
-    """Residuals (M, 2) of the rows, each from what is learned without the instants (I,) of its own fold (M,)."""
-    residual = rows.displacement_px.copy()
+) -> tuple[Float, Float]:
+    """Residuals (M, 2), px, of the rows, each from what is learned without the instants (I,) of its own fold (M,), and
+    the variance (M, 2), px^2, that the posterior without them has there."""
+    residual, variance = rows.displacement_px.copy(), np.empty_like(rows.displacement_px)
     for fold in np.unique(of_row).tolist():
-        coefficients, here = learned.fit_without(of_instant == fold), of_row == fold
-        amounts = trained.features[rows.frame[here]] @ coefficients.T
+        (coefficients, covariance), here = learned.fit_without(of_instant == fold), of_row == fold
+        found = trained.features[rows.frame[here]]
         moved = compute_motions(rows.measured_px[here], trained.observations.image_size)
-        residual[here] -= np.einsum("nak,nk->na", moved, amounts)
-    return residual
+        residual[here] -= np.einsum("nak,nk->na", moved, found @ coefficients.T)
+        variance[here] = _compute_shift_variance(found, covariance, moved)
+    return residual, variance
+
+
+def _compute_shift_variance(features: Float, covariance: Float, motions: Float) -> Float:
+    """(N, 2), px^2, of N points with features (N, H) and motions (N, 2, 8), for coefficients' covariance (8, H, H)."""
+    of_motions = np.einsum("nh,mhk,nk->nm", features, covariance, features, optimize=True)
+    return np.einsum("nam,nm->na", motions**2, of_motions)
 
 
 def _compute_model_discrepancy_px(taught: _ThermalFit) -> Float:
     """(2,): of set-points left out, or what wanders, the larger of both."""
+    return np.maximum(compute_discrepancy_px(taught.rows, taught.held_out), _compute_wander_px(taught))
+
+
+def _compute_wander_px(taught: _ThermalFit) -> Float:
+    """(2,): standard deviation of what wanders, RMS over the markers."""
     moved = compute_motions(taught.rows.measured_px, taught.trained.observations.image_size)
-    wander_px = np.sqrt((moved**2 @ taught.learned.ou_noise_px2).mean(axis=0))
-    return np.maximum(compute_discrepancy_px(taught.rows, taught.held_out), wander_px)
+    return np.sqrt((moved**2 @ taught.learned.ou_noise_px2).mean(axis=0))
 
 
-def _compute_left_out_sessions_px2(taught: _ThermalFit) -> Float:
-    """(N, 2): mean square that a fit of the other sessions leaves of each session, noise taken off. It shows what of
-    the drift does not repeat between them. Only sessions that can be compared have a row."""
+def _compute_left_out_sessions(taught: _ThermalFit) -> Float:
+    """(N,): mean square that a fit of the other sessions leaves of each session, noise taken off, over what that fit's
+    posterior says. It shows what of the drift does not repeat between them. Only sessions that can be compared have
+    one."""
     trained, rows = taught.trained, taught.rows
     session_index = trained.observations.session[rows.frame].astype(float)
     covered = [
@@ -294,14 +291,15 @@ def _compute_left_out_sessions_px2(taught: _ThermalFit) -> Float:
         if _is_covered_by_others(rows.chamber_degC, session_index, index)
     ]
     if not covered:
-        return np.zeros((0, 2))
+        return np.zeros(0)
     own = rows.where(np.isin(session_index, covered))
     session_index = trained.observations.session[own.frame].astype(float)
-    left = _compute_held_out_residuals(
+    left, predicted = _compute_held_out_residuals(
         trained, taught.learned, own, taught.learned.instants.session.astype(float), session_index
     )
     squares = left**2 - own.variance_px2
-    return np.array([squares[session_index == index].mean(axis=0) for index in covered])
+    found = [squares[session_index == index].mean() / predicted[session_index == index].mean() for index in covered]
+    return np.maximum(found, 0.0)
 
 
 def _is_covered_by_others(chamber_degC: Float, session_index: Float, index: float) -> bool:
@@ -327,7 +325,8 @@ def _make_candidate(taught: _ThermalFit) -> Candidate:
 
 
 def _make_model(taught: _ThermalFit, heating_K: float) -> ThermalModel:
-    trained, learned, left_px = taught.trained, taught.learned, _compute_model_discrepancy_px(taught)
+    trained, learned, sessions = taught.trained, taught.learned, _compute_left_out_sessions(taught)
+    claims = estimate_claims(taught.rows, taught.held_out, taught.predicted_px2, _compute_wander_px(taught), sessions)
     camera_degC = _compute_extent(trained.states.camera_degC[np.unique(trained.rows.frame)])
     found = ThermalModel(
         facts=collect_facts(trained.observations, taught.rows, camera_degC, trained.origin.camera_degC),
@@ -336,17 +335,26 @@ def _make_model(taught: _ThermalFit, heating_K: float) -> ThermalModel:
         self_heating_K=heating_K,
         reference_features=trained.reference_features,
         coefficients=learned.coefficients,
-        coefficient_covariance=learned.covariance
-        + _JACKKNIFE_WEIGHT * learned.compute_jackknife_covariance(learned.instants.chamber_degC),
+        coefficient_covariance=learned.covariance,
         leverage_matrix=learned.covariance[0] + learned.covariance[1],
-        discrepancy_px=left_px,
+        discrepancy_px=_compute_model_discrepancy_px(taught),
         valid=_compute_range(trained),
         has_warm_up=bool(trained.observations.of(Role.WARM_UP).any()),
         candidates=(_make_candidate(taught),),
-        between_sessions=estimate_between_sessions(left_px, _compute_left_out_sessions_px2(taught)),
+        claims=claims,
+        between_sessions=BetweenSessions(_compute_more_px(taught, claims), len(sessions)),
     )
     largest = float(found.compute_leverage(trained.states.where(np.unique(trained.rows.frame))).max())
     return replace(found, valid=replace(found.valid, leverage=largest, history_s=_compute_history_s(found)))
+
+
+def _compute_more_px(taught: _ThermalFit, claims: Claims) -> Pair:
+    """What another session adds, along I and J: RMS over the rows at set-points."""
+    moved = compute_motions(taught.rows.measured_px, taught.trained.observations.image_size)
+    features = taught.trained.features[taught.rows.frame]
+    variance_px2 = _compute_shift_variance(features, taught.learned.covariance, moved).mean(axis=0)
+    more = max(claims.factors[Question.ANOTHER] - claims.factors[Question.WITHIN], 0.0)
+    return make_pair(np.sqrt(more * variance_px2))
 
 
 def _compute_history_s(model: ThermalModel) -> float:

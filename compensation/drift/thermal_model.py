@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
 from thermostand.compensation.drift.candidates import Pair
+from thermostand.compensation.drift.claims import WARMING_S, BetweenSessions, Claims, Question
 from thermostand.compensation.drift.drift_model import (
     DriftModel,
     Flags,
@@ -28,55 +28,6 @@ from thermostand.compensation.drift.terms import TERMS, Term, build_state_spec, 
 from thermostand.compensation.drift_runtime import SETTLED_TAUS, remembered
 from thermostand.compensation.expression import Origin
 from thermostand.compensation.history.thermal_history import Float, States, ThermalStateSpec
-
-# Instead of it 3 or 5 mpx for all, or a posterior 1.3 to 2 times as wide, were no better at the same width.
-_LEAST_PX, _OF_DISCREPANCY = 0.002, 0.8
-"""What a session leaves at set-points that were left out another session leaves again, in another way; and a little
-in any case. Chosen on presets 300 to 303 and 48 drawn cameras."""
-# On 56 pairs of development sessions 92.5 to 100 % of the unflagged answers hold in most cases, for 91.3 to 100 without
-# the prior. Where no sessions can be compared Student's factor is 1.42; half the weight makes it 2.2, twice 1.18.
-_PRIOR_SESSIONS = 4.0
-"""The prior weighs as much as so many sessions."""
-_SIGMA_95, _TAIL = 1.959964, 0.975
-
-
-@dataclass(frozen=True, slots=True)
-class BetweenSessions:
-    """sigma_px: along I and J; 1.96 times it is half of the 95 % interval of what another session adds. sessions: how
-    many sessions were compared with others; 0: it was assumed, not measured."""
-
-    sigma_px: Pair
-    sessions: int
-
-    @property
-    def is_assumed(self) -> bool:
-        """Whether no two sessions were compared."""
-        return self.sessions == 0
-
-    @property
-    def text(self) -> str:
-        """A sentence that says how well sessions repeat."""
-        i, j = (1e3 * sigma_px for sigma_px in self.sigma_px)
-        if self.is_assumed:
-            return (
-                f"how well sessions repeat was assumed, not measured: {i:.1f} mpx (I) and {j:.1f} mpx (J) are added in "
-                "sessions that were not fitted; a second one over the same set-points, in another order, measures it"
-            )
-        shown = "one session shows" if self.sessions == 1 else f"{self.sessions} sessions show"
-        return f"sessions repeat to {i:.1f} mpx (I) and {j:.1f} mpx (J), as {shown}"
-
-
-def estimate_between_sessions(discrepancy_px: Float, left_px2: Float) -> BetweenSessions:
-    """discrepancy_px (2,): what is left at set-points left out, within sessions. left_px2 (N, 2): mean square that
-    is left of each of N sessions by a fit of the others, noise taken off; (0, 2) where none can be compared."""
-    sessions = len(left_px2)
-    assumed_px2 = _LEAST_PX**2 + (_OF_DISCREPANCY * discrepancy_px) ** 2
-    measured_px2 = np.maximum(left_px2 - discrepancy_px**2, 0.0).sum(axis=0)
-    freedom = _PRIOR_SESSIONS + sessions
-    variance_px2 = (_PRIOR_SESSIONS * assumed_px2 + measured_px2) / freedom
-    i, j = (np.sqrt(variance_px2) * float(stdtrit(freedom, _TAIL)) / _SIGMA_95).tolist()
-    return BetweenSessions((i, j), sessions)
-
 
 # Three times the variance of the least known state of the fit. Plays of parts are taken as known here: with their
 # openness in the leverage 34 to 81 % of answers had no flag, without it 51 to 100, and as many of their intervals hold.
@@ -100,14 +51,14 @@ class ThermalRange:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ThermalModel(DriftModel):
-    """terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2.
-    leverage_matrix (H, H), px^2: what features of a state are to the posterior of the shift along I and J, without what
-    the covariance has beyond that; it says which states are like those of the fit.
+    """terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2:
+    their posterior. claims: what that is multiplied by, for each kind of question. leverage_matrix (H, H), px^2: what
+    features of a state are to the posterior of the shift along I and J; it says which states are like those of the fit.
 
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
-    the shift at the reference is about 0. discrepancy_px is within sessions. between_sessions: what another one adds
-    to it, which `covariance` contains; None in older models, in which the discrepancy has it, and of sessions that were
-    fitted. has_warm_up: whether a warm-up was among the training frames.
+    the shift at the reference is about 0. discrepancy_px: at set-points that were left out. between_sessions: what is
+    claimed beyond that in another session; None of sessions that were fitted, and where both are the same.
+    has_warm_up: whether a warm-up was among the training frames.
     """
 
     form = "thermal"
@@ -121,6 +72,7 @@ class ThermalModel(DriftModel):
     valid: ThermalRange
     has_warm_up: bool
     between_sessions: BetweenSessions | None = None
+    claims: Claims = field(default_factory=Claims)
 
     @property
     def title(self) -> str:
@@ -144,20 +96,29 @@ class ThermalModel(DriftModel):
         return np.einsum("nak,nk->na", compute_motions(xy_px, self.facts.image_size), amounts)
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:
-        """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: of the coefficients, which
-        know little of a state unlike those of the fit, and of what the form leaves unexplained. That was seen at
-        set-points that were left out, and is taken to grow with the leverage beyond the largest of the fit. It holds
-        for sessions that were not fitted: of those that were, ask the model that `of_sessions` gives."""
-        found = self._compute_features(state, len(xy_px))
+        """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself: that of the coefficients,
+        times the factor for the kind of question that a state is (compensation/drift/claims.py). It holds for sessions
+        that were not fitted: of those that were, ask the model that `of_sessions` gives."""
+        states = broadcast_states(state, len(xy_px), self.memory)
+        found = self._compute_features(states, len(xy_px))
         moved = compute_motions(xy_px, self.facts.image_size)
         variance = np.einsum("nh,mhk,nk->nm", found, self.coefficient_covariance, found, optimize=True)
-        more = np.maximum(
-            self.compute_leverage(broadcast_states(state, len(xy_px), self.memory)) / self.valid.leverage, 1.0
-        )
         of_coefficients = (moved * variance[:, None, :]) @ moved.transpose(0, 2, 1)
-        unexplained = of_coefficients + more[:, None, None] * np.diag(self.discrepancy_px**2)
-        known = self.between_sessions
-        return unexplained if known is None else unexplained + np.diag(np.square(known.sigma_px))
+        return self._select_factors(states)[:, None, None] * of_coefficients + np.diag(np.square(self.claims.least_px))
+
+    def _select_factors(self, states: States) -> Float:
+        """(N,): in a session that was fitted it goes over from that for states between those of the fit, as the
+        leverage goes from the largest of them to where states are flagged."""
+        lately = Question.SWITCHED_ON if self.has_warm_up else Question.UNTAUGHT
+        question = np.where(states.on_s < WARMING_S, lately, Question.ANOTHER)
+        is_warm = question == Question.ANOTHER
+        question[is_warm & (self._compute_temperature_flags(states) != 0)] = Question.BEYOND
+        factors = np.array(self.claims.factors)
+        found = factors[question]
+        if self.between_sessions is not None:
+            return found
+        away = (self.compute_leverage(states) / self.valid.leverage - 1) / (_MORE_LEVERAGE - 1)
+        return factors[Question.WITHIN] + np.clip(away, 0.0, 1.0) * (found - factors[Question.WITHIN])
 
     def of_sessions(self, session_ids: Iterable[str]) -> ThermalModel:
         """The model for these sessions: where it was fitted to all of them, without what other sessions add."""
@@ -185,12 +146,15 @@ class ThermalModel(DriftModel):
         states = broadcast_states(state, count, self.memory)
         return compute_features(states, [term.feature for term in self.terms], self.origin) - self.reference_features
 
+    def _compute_temperature_flags(self, states: States) -> Flags:
+        found = compute_range_flags(states.camera_degC, _widen(self.facts.camera_range_degC), Outside.CAMERA)
+        (ambient_degC,) = states.of([self.memory.ambient_lag]).T
+        return found | compute_range_flags(ambient_degC, _widen(self.valid.ambient_degC), Outside.AMBIENT)
+
     def _compute_state_flags(self, states: States) -> Flags:
         valid = self.valid
-        found = compute_range_flags(states.camera_degC, _widen(self.facts.camera_range_degC), Outside.CAMERA)
+        found = self._compute_temperature_flags(states)
         found |= compute_range_flags(states.on_s, (valid.least_on_s - 1, np.inf), Outside.SWITCHED_ON)
-        (ambient_degC,) = states.of([self.memory.ambient_lag]).T
-        found |= compute_range_flags(ambient_degC, _widen(valid.ambient_degC), Outside.AMBIENT)
         # By the leverage and not only by each range: at temperatures never fitted intervals cover 94 % where they
         # covered 79 (12 drawn cameras, 17 to 45 degC fitted, 10 to 52 asked).
         found |= compute_range_flags(

@@ -25,6 +25,7 @@ BENCHMARKS = (
         "photographs",
         "claimed_variances",
         "drift",
+        "coverage",
         "datasheet",
         "soaks",
     ),

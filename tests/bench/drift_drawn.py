@@ -32,12 +32,15 @@ _SIGMA_95 = 1.959964
 @dataclass(frozen=True)
 class Score:
     """rms_mpx: of both coordinates of what compensation leaves of the truth. covered, unflagged: shares of these
-    deviations in the 95 % interval, and without a flag; covered_unflagged: the former of the latter."""
+    deviations in the 95 % interval, and without a flag; covered_unflagged, covered_flagged: the former of the latter
+    and of the others, NaN without any. claimed_mpx: RMS of the standard deviations that are claimed."""
 
     rms_mpx: float
     covered: float
     unflagged: float
     covered_unflagged: float
+    covered_flagged: float
+    claimed_mpx: float
 
 
 def draw_effects(seed: int, *, unrepeating: bool) -> tuple[tuple[str, ...], str]:
@@ -74,9 +77,9 @@ def score(
         flags.append(model.flags(truth[frame], state))
     deviations, clear = np.array(left), np.array(flags) == 0
     holds = np.abs(deviations) <= _SIGMA_95 * np.sqrt(np.array(claimed))
-    covered_unflagged = float(holds[clear].mean()) if clear.any() else float("nan")
-    rms_mpx = 1e3 * float(np.sqrt(np.mean(deviations**2)))
-    return Score(rms_mpx, float(holds.mean()), float(clear.mean()), covered_unflagged)
+    of_clear, of_flagged = (float(holds[own].mean()) if own.any() else float("nan") for own in (clear, ~clear))
+    rms_mpx, claimed_mpx = (1e3 * float(np.sqrt(np.mean(squares))) for squares in (deviations**2, np.array(claimed)))
+    return Score(rms_mpx, float(holds.mean()), float(clear.mean()), of_clear, of_flagged, claimed_mpx)
 
 
 def figures() -> Iterator[Figure]:

@@ -17,7 +17,7 @@ from thermostand.compensation.drift.model_selection import fit, select_better
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.drift.terms import BacklashTerm
 from thermostand.compensation.drift.thermal_fit import fit_thermal
-from thermostand.compensation.drift.thermal_model import ThermalModel, estimate_between_sessions
+from thermostand.compensation.drift.thermal_model import ThermalModel
 from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.history.thermal_history import (
     States,
@@ -129,7 +129,7 @@ def test_the_covariance_is_symmetric_and_grows_away_from_what_was_learned(record
     points = np.array([[1200.0, 1000.0], [2200.0, 1600.0]])
     near, far = thermal.covariance(points, usual), thermal.covariance(points, hot)
     np.testing.assert_allclose(near, near.transpose(0, 2, 1), rtol=0, atol=1e-12)
-    assert (np.diagonal(near, axis1=1, axis2=2) >= thermal.discrepancy_px**2).all()
+    assert (np.diagonal(near, axis1=1, axis2=2) >= np.square(thermal.claims.least_px)).all()
     assert (np.trace(far, axis1=1, axis2=2) > 10 * np.trace(near, axis1=1, axis2=2)).all()
 
 
@@ -225,38 +225,3 @@ def test_a_session_that_only_one_form_can_be_fitted_to_has_that_form_and_says_wh
     assert sentence.startswith("the paper form")
     with pytest.raises(SessionError, match="at 3 chamber temperatures"):
         fit(observed, form="paper")
-
-
-# What another session adds: assumed of one session, and known better with each that is compared.
-
-
-NONE_PX2 = np.zeros((0, 2))
-
-
-def test_of_one_session_it_is_assumed_and_says_so():
-    found = estimate_between_sessions(np.array([0.0, 0.010]), NONE_PX2)
-    assert found.is_assumed
-    assert "assumed, not measured" in found.text
-    # Four sessions' worth: Student's t of 4 degrees of freedom reaches 2.776 where a normal distribution reaches 1.960.
-    assert found.sigma_px == pytest.approx((0.002 * 2.776 / 1.96, np.hypot(0.002, 0.008) * 2.776 / 1.96), rel=1e-3)
-
-
-def test_sessions_that_agree_make_it_smaller_and_sessions_that_do_not_larger():
-    left_px = np.array([0.004, 0.004])
-    agreeing = [
-        estimate_between_sessions(left_px, np.full((sessions, 2), left_px**2)).sigma_px[0] for sessions in (0, 2, 4, 12)
-    ]
-    assert agreeing == sorted(agreeing, reverse=True)
-    assert agreeing[-1] < 0.5 * agreeing[0]
-    off_px2 = np.full((2, 2), 0.020**2)
-    found = estimate_between_sessions(left_px, off_px2)
-    assert not found.is_assumed
-    assert found.sigma_px[0] > 2 * agreeing[0]
-    assert "as 2 sessions show" in found.text
-
-
-def test_with_many_sessions_it_is_what_they_show():
-    """Sessions that differ by 10 mpx, one standard deviation."""
-    rng = np.random.default_rng(1)
-    left_px2 = 0.003**2 + (0.010 * rng.standard_normal((400, 2))) ** 2
-    assert estimate_between_sessions(np.full(2, 0.003), left_px2).sigma_px == pytest.approx((0.010, 0.010), rel=0.1)
