@@ -76,7 +76,7 @@ class Claims:
 @dataclass(frozen=True, slots=True)
 class BetweenSessions:
     """sigma_px: along I and J, what is claimed in another session beyond what is claimed within those of the fit; RMS
-    over the fitted set-points. sessions: how many sessions were compared with others; 0: it was assumed, not measured."""
+    over the fitted set-points. sessions: how many were compared with others; 0: it was assumed, not measured."""
 
     sigma_px: Pair
     sessions: int

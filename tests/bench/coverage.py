@@ -121,7 +121,7 @@ def ask_drawn(number: int) -> Scores:
 def ask_preset(number: int) -> Scores:
     """Scores of one simulated camera of configs/optics, by the kind of question."""
     rng = np.random.default_rng([41, number])
-    effects = [name for name in _PRESET_REPEATING if rng.random() < _CHANCE]
+    effects: list[Effect] = [name for name in _PRESET_REPEATING if rng.random() < _CHANCE]
     if number % 2:
         effects.append(_PRESET_UNREPEATING[rng.integers(2)])
     preset = ("nac", "navcam", "dic", "phone")[number % 4]
