@@ -14,8 +14,8 @@ from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.observations import Float, concatenate
 from thermostand.experiments.steps import Role
 
-from .sessions_cameras import draw_camera
-from .sessions_sessions import DrawnSession, make_full_session, record_session
+from .drawn_cameras import draw_camera
+from .drawn_sessions import DrawnSession, make_full_session, record_session
 
 SEED = 2700
 
