@@ -447,7 +447,7 @@ def _check_covariance(covariance_px2: ArrayLike | None, sigma_px: float, missing
 
 
 def _to_array(what: str, given: ArrayLike) -> Float:
-    """As an array; ValueError that says which argument holds no numbers, or rows of different lengths."""
+    """Return an argument as an array; ValueError says which one holds no numbers, or rows of different lengths."""
     try:
         return np.array(given, np.float64)
     except (ValueError, TypeError) as error:

@@ -226,7 +226,7 @@ class Drift:
         return self._model.get("history_s", 0.0)
 
     def advance(self, dt_s, ambient_degC, power_on, camera_degC):
-        """As ThermalState.advance."""
+        """Advance the camera's thermal state, as ThermalState.advance does."""
         self.state.advance(dt_s, ambient_degC, power_on, camera_degC)
         measured = camera_degC if is_temperature(camera_degC) else math.nan
         self._camera_degC = self.state.camera_degC if self.state.begun else measured
@@ -242,7 +242,7 @@ class Drift:
         return self._moved(points_px, amounts)
 
     def correct(self, points_px):
-        """Where the points (N, 2), px, would be at the reference."""
+        """Return where the points (N, 2), px, would be at the reference."""
         return np.asarray(points_px, float) + self.shift(points_px)
 
     def intrinsics(self, k):
@@ -259,15 +259,15 @@ class Drift:
         return grown @ k
 
     def lattice(self):
-        """Where to read in the measured image, less the place itself: offsets (M, N, 2), px, at every 16th pixel of the
-        corrected image in both directions, the last ones beyond it."""
+        """Return where to read in the measured image, less the place itself: offsets (M, N, 2), px, at every 16th pixel
+        of the corrected image in both directions, the last ones beyond it."""
         width, height = self._model["image_size_px"]
         at_x, at_y = (np.arange(0.0, size + LATTICE_PX, LATTICE_PX) for size in (width, height))
         places = np.stack(np.meshgrid(at_x, at_y), axis=-1)
         return source_offset(self.shift, places.reshape(-1, 2)).reshape(places.shape)
 
     def maps(self):
-        """Two float32 (height, width) for cv2.remap: where to read in the measured image for each pixel of the
+        """Return two float32 (height, width) for cv2.remap: where to read in the measured image for each pixel of the
         corrected one. NaN where the state is unknown: look at `flags`, and do not remap with it."""
         width, height = self._model["image_size_px"]
         lattice = self.lattice()
@@ -364,7 +364,7 @@ def _check(model):
 
 
 def expression_of(value):
-    """Of the lists of a JSON file; ValueError for what no expression has."""
+    """Build an expression from the lists of a JSON file; ValueError for what no expression has."""
     if isinstance(value, (list, tuple)):
         found = tuple(map(expression_of, value))
         if found[:1] in (("lag",), ("play",)) and (len(found) != 3 or not found[2] > 0):
@@ -376,13 +376,13 @@ def expression_of(value):
 
 
 def is_temperature(degC):
-    """Whether it can be one; NaN cannot."""
+    """Return whether it can be one; NaN cannot."""
     return COLDEST_degC <= degC <= HOTTEST_degC
 
 
 def source_offset(shift, xy_px):
-    """Where a point that is seen at (N, 2) px at the reference is in the measured image, less those points: the shift
-    maps measured to reference, so it is inverted by fixed-point steps."""
+    """Return where a point that is seen at (N, 2) px at the reference is in the measured image, less those points: the
+    shift maps measured to reference, so it is inverted by fixed-point steps."""
     offset = np.zeros_like(xy_px)
     for _ in range(ROUNDS):
         offset = -shift(xy_px + offset)

@@ -104,7 +104,8 @@ _LAGGED = {INPUTS[0]: "camera", INPUTS[1]: "air", INPUTS[2]: "supply"}
 
 
 def format_words(feature: Feature) -> str:
-    """As the formula of a report has it: air(8 min)^2, play(3 K); what is `away` is called as what it is of."""
+    """Write the expression as the formula of a report has it: air(8 min)^2, play(3 K); what is `away` is called as what
+    it is of."""
     if not isinstance(feature, tuple):
         return f"{feature:g}"
     match feature:

@@ -98,10 +98,11 @@ _PREVIEW_WIDTH_PX = 816  # a third of a 5 MP frame, which is enough on a page
 
 @dataclass(frozen=True, slots=True)
 class SessionFacts:
-    """Where frames come from. simulated: whether the laboratory was, None when the session does not say. incomplete:
-    segments that a killed recorder left behind and that were not read. utc: from its instants to UTC. spots: what a
-    thermal imager saw of the camera, name -> (time_ns, degC). suspect: frames that the noise model does not describe,
-    so that the covariance of their centres is an estimate (markers.Detection). uid: of the session alone."""
+    """The facts of a session from which frames come. simulated: whether the laboratory was, None when the session does
+    not say. incomplete: segments that a killed recorder left behind and that were not read. utc: from its instants to
+    UTC. spots: what a thermal imager saw of the camera, name -> (time_ns, degC). suspect: frames that the noise model
+    does not describe, so that the covariance of their centres is an estimate (markers.Detection). uid: of the session
+    alone."""
 
     session_id: str
     recipe: str
@@ -176,7 +177,8 @@ class Observations:
         return self.usable & np.isin(self.role, [str(role) for role in roles])
 
     def find_switch_on_ns(self, session: int, before_ns: int) -> int | None:
-        """When the camera's supply last came on before an instant of a session; None when that is not recorded."""
+        """Return when the camera's supply last came on before an instant of a session; None when that is not
+        recorded."""
         if not self.histories:
             return None
         history = self.histories[session]

@@ -42,7 +42,7 @@ def check_shape(name: str, values: object, shape: tuple[int, ...]) -> Float:
 
 
 def check_covariance(name: str, covariance: Float) -> None:
-    """Of (n, n) or several of them (..., n, n): no variance below 0, symmetric and positive semidefinite within
+    """Check covariances (n, n) or (..., n, n): no variance below 0, symmetric and positive semidefinite within
     rounding. Judged by the correlations: parameters of different units have variances of different sizes."""
     size = covariance.shape[-1]
     for matrix in covariance.reshape(-1, size, size):

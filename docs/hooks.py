@@ -220,7 +220,7 @@ def _commands(command: Any, name: str) -> Iterator[str]:
 
 
 def _help(text: str) -> str:
-    """Its paragraphs; the last line, `Example: ...`, as code."""
+    """Return the paragraphs of a help text; its last line, `Example: ...`, becomes code."""
     summary, _, example = text.replace("\b", "").partition("Example: ")
     return _paragraphs(summary) + (f"\n\n```console\n{example.strip()}\n```" if example else "")
 

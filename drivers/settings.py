@@ -88,8 +88,8 @@ class CameraSettings(Polled):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Which device has answered; a field that it does not tell is "". by_map: vendor and model are those of a register
-    map or profile, which the device itself does not tell."""
+    """The device that has answered; a field that it does not report is "". by_map: vendor and model are those of a
+    register map or profile, which the device itself does not tell."""
 
     vendor: str
     model: str
@@ -104,8 +104,8 @@ class Identity:
         return ", ".join([f"{named} (by its register map)" if self.by_map else named, *details])
 
     def is_another_than(self, before: Identity) -> bool:
-        """Whether something that both state differs: one that states nothing cannot be distinguished from others of
-        its kind."""
+        """Return whether something that both state differs: one that states nothing cannot be distinguished from others
+        of its kind."""
         pairs = (
             (self.vendor, before.vendor),
             (self.model, before.model),
@@ -126,8 +126,8 @@ def check_same_device(device: str, found: Identity, before: Identity | None) -> 
 
 
 def make_identity_event(device: str, identity: Identity, now_ns: int, camera: CameraSettings | None = None) -> Event:
-    """With the device's name, what it tells of itself, and of a camera the lens that its settings state ("" when they
-    do not)."""
+    """Make the event with the device's name, what it reports of itself, and of a camera the lens that its settings
+    state ("" when they do not)."""
     data: dict[str, object] = {"device": device, **asdict(identity)}
     text = str(identity)
     if not identity.serial_number:

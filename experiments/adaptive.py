@@ -105,7 +105,7 @@ def apply_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
 
 
 def _append_next_decision(decide: Decide, steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """These steps, then the next decision and the fixed visits for which there is time behind them."""
+    """Return these steps, then the next decision and the fixed visits for which time is left behind them."""
     left_s = max(0.0, decide.left_s - estimate_duration_s(steps))
     validations = _plan_validations(decide, decide.unvalidated_degC)
     longest_s = estimate_duration_s(_plan_visit(decide, decide.warmest_degC, max(decide.soaks_s)))

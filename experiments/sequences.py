@@ -49,7 +49,8 @@ def move_table(table_position: Mapping[str, float]) -> Iterator[Step]:
 
 
 def approach_position(position: TablePosition) -> Iterator[Step]:
-    """Both axes approached again, also one that is there already: its motor may have been without current meanwhile."""
+    """Approach with both axes again, also with one that is in its place already: its motor may have been without
+    current meanwhile."""
     yield from move_table(dict(zip(_AXES, (position.linear_mm, position.rotary_deg), strict=True)))
 
 

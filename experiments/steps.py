@@ -106,12 +106,14 @@ class KnownStand:
         return 0.0
 
     def arrival_s(self, from_degC: float, to_degC: float, band_K: float) -> float | None:
-        """When the chamber is in its band after a new set-point; None when no recorded run has shown how fast it is."""
+        """Return when the chamber is in its band after a new set-point; None when no recorded run has shown how fast it
+        is."""
         del from_degC, to_degC, band_K
         return None
 
     def settling_s(self, from_degC: float, to_degC: float, camera_K_per_min: float) -> float | None:
-        """When the camera changes by less than that after a new set-point of the chamber; None when that is unknown."""
+        """Return when the camera changes by less than that after a new set-point of the chamber; None when that is
+        unknown."""
         del from_degC, to_degC, camera_K_per_min
         return None
 
@@ -446,7 +448,7 @@ class Soak(Step):
         return _explain_open_flap(found, self.longest_s)
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
-        """Until the chamber has been in its band for the last part, too, where that is known."""
+        """Return the time until the chamber has been in its band for the last part, too, where that is known."""
         arrival_s = stand.arrival_s(found.from_degC, found.to_degC, self.band_K) if self.band_K else None
         if arrival_s is None:
             return Price(self.kind, self.duration_s)

@@ -26,7 +26,8 @@ class SerialEndpoint(NamedTuple):
 
 
 def parse_tcp_address(address: str, *, may_be_free: bool = False) -> TcpEndpoint:
-    """Where `tcp:HOST:PORT` leads; ValueError when it is none. Port 0, for a free one, only if it `may_be_free`."""
+    """Return where `tcp:HOST:PORT` leads; ValueError when it is none. Port 0, for a free one, only if it
+    `may_be_free`."""
     found = _TCP.fullmatch(address)
     if found is None or not (0 if may_be_free else 1) <= int(found[2]) < 65536:
         raise ValueError("expected tcp:HOST:PORT with a port of 1..65535")
@@ -34,7 +35,7 @@ def parse_tcp_address(address: str, *, may_be_free: bool = False) -> TcpEndpoint
 
 
 def parse_address(address: str) -> SerialEndpoint | TcpEndpoint:
-    """Where `serial:PATH` or `tcp:HOST:PORT` leads; ValueError when it is neither."""
+    """Return where `serial:PATH` or `tcp:HOST:PORT` leads; ValueError when it is neither."""
     if found := _SERIAL.fullmatch(address):
         return SerialEndpoint(found[1])
     if address.startswith("tcp:"):
@@ -63,8 +64,8 @@ _DISPLAY_ADDRESSES: dict[str, str] = {}  # where a stand's simulator answers -> 
 
 
 def set_display_address(address: str, stated: str) -> None:
-    """From now on messages show `stated` for `address`: a simulator answers at a free port, which differs each time,
-    and the messages of a run are recorded."""
+    """Let messages show `stated` for `address` from now on: a simulator answers at a free port, which differs each
+    time, and the messages of a run are recorded."""
     _DISPLAY_ADDRESSES[address] = stated
 
 

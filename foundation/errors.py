@@ -47,7 +47,7 @@ class DeviceError(StandError):
 
 
 class Unreachable(DeviceError):
-    """No answer within the deadline, or the port, bus or address is gone."""
+    """The device gives no answer within the deadline, or the port, bus or address is gone."""
 
     retryable = True
 

@@ -186,7 +186,8 @@ def make_alert(event: Event) -> Alert | None:
 
 
 def must_be_heard(event: Event) -> bool:
-    """Whether somebody has to act on it at once, or a run waits for it: it stays as grave as it is, however often."""
+    """Return whether somebody has to act on it at once, or a run waits for it: it stays as grave as it is, however
+    often."""
     if event.data.get("action") in ("abort", "hold"):
         return True
     row = KINDS.get(event.kind)

@@ -70,5 +70,5 @@ class Hub:
         return self._known.get(channel)
 
     def last_good_ns(self, channel: str) -> int | None:
-        """When `channel` was last measured, GOOD or with a suspect value, or None when it never was."""
+        """Return when `channel` was last measured, GOOD or with a suspect value, or None when it never was."""
         return self._good_ns.get(channel)

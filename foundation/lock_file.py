@@ -38,7 +38,7 @@ def release_lock(path: Path, file: int) -> None:
 
 
 def try_lock(file: int, *, shared: bool = False) -> bool:
-    """Whether the lock was free; does not wait. Raises OSError."""
+    """Return whether the lock was free; does not wait. Raises OSError."""
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -47,7 +47,7 @@ def try_lock(file: int, *, shared: bool = False) -> bool:
 
 
 def is_at(file: int, path: Path) -> bool:
-    """Whether `path` is still a name of the opened file."""
+    """Return whether `path` is still a name of the opened file."""
     try:
         named = os.lstat(path)
     except FileNotFoundError:

@@ -34,7 +34,7 @@ class ShutdownDeadline:
         return min(at_most_s, max(LEAST_S, self._deadline_s - asyncio.get_running_loop().time()))
 
     async def wait(self, work: asyncio.Future[Any], at_most_s: float) -> bool:
-        """Whether `work` has ended in time; it is not cancelled, and what it raises is not raised here."""
+        """Return whether `work` has ended in time; it is not cancelled, and what it raises is not raised here."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + at_most_s
         if self._deadline_s is None:

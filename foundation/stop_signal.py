@@ -28,7 +28,7 @@ class StopSignal:
             os.write(self._ask, b"x")
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Whether it has been asked for within so many real seconds (None: no limit)."""
+        """Return whether it has been asked for within so many real seconds (None: no limit)."""
         return bool(select.select([self._asked], [], [], timeout_s)[0])
 
 

@@ -250,7 +250,7 @@ class WorkerConnection:
         return self._request((method, args, name, ""))
 
     def close(self) -> None:
-        """No more requests; the one under way is completed."""
+        """Take no more requests; the one under way is completed."""
         with suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for an answer
         self._connection.close()

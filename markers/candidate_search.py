@@ -129,9 +129,8 @@ def _fill_holes(patch: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _is_ellipse(moments: dict[str, float], area: float) -> bool:
-    """Whether area = 4 pi sqrt(det of the second central moments); few pixels make a rough outline, so small
-    components are judged with more tolerance.
-    """
+    """Return whether area = 4 pi sqrt(det of the second central moments); few pixels make a rough outline, so small
+    components are judged with more tolerance."""
     # 1/12: the variance within a pixel.
     xx, yy, xy = moments["mu20"] / area + 1 / 12, moments["mu02"] / area + 1 / 12, moments["mu11"] / area
     ellipse = 4 * np.pi * np.sqrt(max(xx * yy - xy * xy, 0.0))
@@ -140,7 +139,7 @@ def _is_ellipse(moments: dict[str, float], area: float) -> bool:
 
 
 def _filter_by_neighbours(found: Candidates, odd_area_ratio: float) -> Candidates:
-    """Without those whose area differs from the median of their 8 neighbours and from the odd marker's."""
+    """Drop candidates whose area differs from the median of their 8 neighbours and from the odd marker's."""
     if len(found) < 9:
         return found
     nearest = np.asarray(KDTree(found.centres_px).query(found.centres_px, 9)[1], dtype=np.intp)[:, 1:]

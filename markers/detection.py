@@ -86,12 +86,13 @@ class ResidualCorrelation:
     levels: float
 
     def exceeds_noise_model(self) -> bool:
-        """Whether what is seen is not what the noise model describes. Of 100 frames of noise alone at most one."""
+        """Return whether what is seen is not what the noise model describes. Of 100 frames of noise alone at most
+        one."""
         limit = max(_CORRELATION_LIMIT, _CHANCE_SIGMAS * self.chance)
         return self.along > _GROWTH_LIMIT - 1 or self.together > limit or self.levels > _LEVELS_LIMIT
 
     def is_suspect(self) -> bool:
-        """Whether it may be suspect, if this is from a sample of the markers: then it takes all to decide."""
+        """Return whether it may be suspect, if this is from a sample of the markers: then it takes all to decide."""
         return (
             self.along > _SUSPECT_GROWTH_LIMIT - 1
             or self.together > _SUSPECT_CORRELATION_LIMIT
@@ -100,7 +101,7 @@ class ResidualCorrelation:
 
 
 def measure_residual_correlation(fit: EdgeFit, clean: NDArray[np.bool_]) -> ResidualCorrelation:
-    """Of the `clean` (N,) markers."""
+    """Measure how the residuals of the `clean` (N,) markers are correlated."""
     if not clean.any():
         return ResidualCorrelation(np.ones(2), 0.0, 0.0, 0.0, 1.0)
     levels = float(np.median(fit.levels[clean] / fit.chi[clean]))
@@ -111,8 +112,8 @@ def measure_residual_correlation(fit: EdgeFit, clean: NDArray[np.bool_]) -> Resi
 
 
 def compute_excess_px2(wide: EdgeFit, narrow: EdgeFit, growth: Float, clean: NDArray[np.bool_]) -> Float:
-    """By what the mean squared difference of the centres (x, y) exceeds that of independent noise, px^2, 0 where it may
-    be chance. growth: of the wide fit. clean: (N,), markers without a flag in both."""
+    """Compute by what the mean squared difference of the centres (x, y) exceeds that of independent noise, px^2, 0
+    where it may be chance. growth: of the wide fit. clean: (N,), markers without a flag in both."""
     if not clean.any():
         return np.zeros(2)
     difference = np.mean((wide.state.centres_px() - narrow.state.centres_px())[clean] ** 2, axis=0)
@@ -216,9 +217,9 @@ seen, in radii: the search for it begins in its place and goes further."""
 
 
 def is_still_in_place(picture: Picture, state: EdgeState, is_seen: Mask, inwards: Float) -> bool:
-    """Whether the markers (N,) that were seen still look as they did: a glance at 16 pixels on either side of each
-    outline, not nearer to the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere because the
-    target has moved."""
+    """Return whether the markers (N,) that were seen still look as they did: a glance at 16 pixels on either side of
+    each outline, not nearer to the centre than `inwards` (N, 1) radii. Much cheaper than a fit that ends nowhere
+    because the target has moved."""
     m11, m12, m22 = (state.parameters[:, [each]] for each in (M11, M12, M22))
     radius = state.scale_px[:, None] / np.sqrt(m11 * _TOWARDS[0] ** 2 + m22 * _TOWARDS[1] ** 2 + m12 * _TWICE)
     margin = np.minimum(_PROBE_BLURS * state.parameters[:, [SIGMA]], np.minimum(0.6, 1 - inwards) * radius)
@@ -233,8 +234,8 @@ def is_still_in_place(picture: Picture, state: EdgeState, is_seen: Mask, inwards
 
 
 def has_followed(now_px: Float, before_px: Float) -> bool:
-    """Whether centres (N, 2), NaN for missing ones, are of the same markers as before: about as many, and none far from
-    where it was."""
+    """Return whether centres (N, 2), NaN for missing ones, are of the same markers as before: about as many, and none
+    far from where it was."""
     found, found_before = (int(np.isfinite(centres[:, 0]).sum()) for centres in (now_px, before_px))
     moved = np.linalg.norm(now_px - before_px, axis=1)
     return bool(found >= _FOLLOWED_PART * found_before and np.nanmax(moved) < _GREATEST_STEP_PX)
@@ -370,7 +371,7 @@ class Detection:
 
 
 def _ignore_progress(part: float) -> None:
-    """No progress is shown."""
+    """Show no progress."""
 
 
 def detect(
@@ -663,7 +664,7 @@ _get_reach = cast("Callable[[Target], Float]", lru_cache(maxsize=16)(_compute_re
 
 
 def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.bool_]:
-    """Whether the discs stand out of the ground, in the right direction."""
+    """Return whether the discs stand out of the ground, in the right direction."""
     sign = 1 if target.polarity == "dark" else -1
     level = np.maximum(state.parameters[:, B0], state.parameters[:, F0])
     return sign * state.contrast_DN() > _LEAST_CONTRAST_SIGMA * np.sqrt(noise.variance_DN2(level))
@@ -672,7 +673,7 @@ def _has_contrast(state: EdgeState, target: Target, noise: Noise) -> NDArray[np.
 def _is_in_place(
     state: EdgeState, homography: Float, expected: EdgeState, target: Target, good: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Whether each ellipse has about the place and the size that the other markers imply."""
+    """Return whether each ellipse has about the place and the size that the other markers imply."""
     limit_px = _PLACE_TOLERANCE_PITCH * compute_pitch_px(homography, target)
     off_px = np.linalg.norm(state.centres_px() - project(homography, target.coordinates_mm()), axis=1)
     if np.any(off_px[good] > _FLAT_PART * limit_px):  # a wide lens, or a wrong one among them
@@ -685,7 +686,7 @@ def _is_in_place(
 
 
 def _is_within_image(state: EdgeState, picture: Picture) -> NDArray[np.bool_]:
-    """Whether the whole outline is in the image, give or take its blur."""
+    """Return whether the whole outline is in the image, give or take its blur."""
     height, width = picture.shape
     margin = state.half_extents_px() - state.parameters[:, SIGMA, None]
     centres = state.centres_px()

@@ -79,7 +79,7 @@ class EdgeFit:
 
     @property
     def covariance_px2(self) -> Float:
-        """Of the centres (N, 2, 2)."""
+        """The covariances of the centres (N, 2, 2)."""
         return self.covariance[:, :2, :2]
 
 
@@ -128,7 +128,7 @@ class _Fitted(NamedTuple):
 
 
 def make_setting(image: Picture, start: EdgeState, noise: Noise, band_sigma: float) -> Setting:
-    """For fits from `start`."""
+    """Make the setting of fits from `start`."""
     pixels = allocate_pixels(_compute_capacity(image, start, band_sigma))
     variance = noise.floor_DN2, noise.slope_DN
     return Setting(image, variance, image.full_scale_DN - 1, band_sigma, pixels, allocate_work())

@@ -69,7 +69,7 @@ class EdgeState:
         return self.scale_px / np.sqrt(np.sqrt(p[:, M11] * p[:, M22] - p[:, M12] ** 2))
 
     def half_extents_px(self) -> Float:
-        """Half width and half height of each ellipse's bounding box, shape (N, 2)."""
+        """Return half width and half height of each ellipse's bounding box, shape (N, 2)."""
         p = self.parameters
         determinant = p[:, M11] * p[:, M22] - p[:, M12] ** 2
         return self.scale_px[:, None] * np.sqrt(p[:, [M22, M11]] / determinant[:, None])
@@ -90,7 +90,7 @@ class Work(NamedTuple):
 
 
 def allocate_work() -> Work:
-    """Not filled yet."""
+    """Allocate the arrays of a fit, not filled yet."""
     return Work(np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS))
 
 
@@ -167,7 +167,8 @@ def _keep_residuals(block: Single, size: int, table: Single, first: int) -> None
 
 @compile_part
 def compute_derivatives(block: Single, size: int, p: Float, scale: float, noise: Variance) -> tuple[float, float]:
-    """From the first `size` pixels of `block` its weighted derivatives by the parameters and weighted residuals.
+    """Compute from the first `size` pixels of `block` the weighted derivatives by the parameters and the weighted
+    residuals.
 
     Terms that vanish on the outline are left out: the fit still ends where J'We = 0, which is free of bias while the
     model holds. The rows of `block` lie one after the other, BLOCK numbers each, so that the compiler sees that they

@@ -184,9 +184,8 @@ def _count_seen(candidate: Index) -> int:
 
 
 def _is_counter_clockwise(cells: Index, points: Float) -> bool:
-    """Whether the lattice, as numbered, is seen from the front: the second axis is a quarter turn counter-clockwise
-    of the first, which is a negative cross product while y points down.
-    """
+    """Return whether the lattice, as numbered, is seen from the front: the second axis is a quarter turn
+    counter-clockwise of the first, which is a negative cross product while y points down."""
     design = np.column_stack([cells, np.ones(len(cells))])
     first, second = np.linalg.lstsq(design, points, rcond=None)[0][:2]
     return bool(first[0] * second[1] - first[1] * second[0] < 0)
@@ -221,7 +220,7 @@ looks like a hole, dirt fills one. Another turn of the target has at least as ma
 
 
 def select_by_marks(placements: list[GridPlacement], candidates: Candidates, target: Target) -> list[GridPlacement]:
-    """Those placements that the marks agree with, all when the target has none. Raises DetectionError when there are
+    """Keep the placements that the marks agree with, all when the target has none. Raises DetectionError when there are
     none, and says when a mirror image would agree."""
     if target.odd_marker is not None:
         return _select_by_odd_marker(placements, candidates, target, target.odd_marker)
@@ -233,7 +232,7 @@ def select_by_marks(placements: list[GridPlacement], candidates: Candidates, tar
 def _select_by_odd_marker(
     placements: list[GridPlacement], candidates: Candidates, target: Target, odd: OddMarker
 ) -> list[GridPlacement]:
-    """Those with a disc of the odd size in the odd marker's place."""
+    """Keep the placements with a disc of the odd size in the odd marker's place."""
     tolerance = 0.5 * abs(np.log(odd.diameter_mm / target.diameter_mm))
 
     def agrees(placement: GridPlacement) -> bool:
@@ -249,7 +248,7 @@ def _select_by_odd_marker(
 def _select_by_donuts(
     placements: list[GridPlacement], candidates: Candidates, target: Target, donuts: DonutMarkers
 ) -> list[GridPlacement]:
-    """Those whose holes are where they should be, with the fewest wrong ones."""
+    """Keep the placements whose holes are where they should be, with the fewest wrong ones."""
     wrong = [_count_wrong_holes(p, candidates, target) for p in placements]
     if min(wrong) <= _MOST_WRONG:
         return [p for p, number in zip(placements, wrong, strict=True) if number == min(wrong)]
@@ -374,7 +373,7 @@ def _make_too_few_error(found: int, target: Target) -> DetectionError:
 def _select_near_previous(
     placements: list[GridPlacement], points: Float, target: Target, previous: Float | None
 ) -> list[GridPlacement]:
-    """Those within half a pitch of where the frame before had the markers; all when there are none."""
+    """Keep the placements within half a pitch of where the frame before had the markers; all when none is."""
     if previous is None:
         return placements
     expected = project(previous, target.coordinates_mm())
@@ -409,7 +408,8 @@ def _select_by_residual(
 def _select_cut_by_frame(
     placements: list[GridPlacement], target: Target, shape: tuple[int, int] | None
 ) -> list[GridPlacement]:
-    """Those with missing markers, all of which are cut by the image's border or beyond it; none when one has all."""
+    """Keep the placements with missing markers, all of which are cut by the image's border or beyond it; none when one
+    has all."""
     if shape is None or any(p.seen == target.count for p in placements):
         return []
     limits = np.array(shape[::-1]) - 1
@@ -425,7 +425,7 @@ def _select_cut_by_frame(
 
 
 def _is_same_window(one: GridPlacement, other: GridPlacement, target: Target) -> bool:
-    """Whether two placements cover the same part of the image, however rotated: their corners coincide."""
+    """Return whether two placements cover the same part of the image, however rotated: their corners coincide."""
     columns, rows = target.columns, target.rows
     corners = target.nominal_mm()[[0, columns - 1, columns * (rows - 1), columns * rows - 1]]
     first, second = project(one.homography, corners), project(other.homography, corners)
@@ -452,7 +452,7 @@ def _select_by_roll(placements: list[GridPlacement], target: Target, previous: F
 
 
 def _drop_clutter(chosen: GridPlacement, points: Float, target: Target) -> Identified:
-    """Without what lies off the place that the others give it: clutter in line with the grid."""
+    """Drop what lies off the place that the others give it: clutter in line with the grid."""
     candidate = settle_table(chosen.candidate, points, KDTree(points), target)
     kept = candidate >= 0
     _require(int(kept.sum()), target)

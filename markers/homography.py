@@ -66,7 +66,7 @@ def compute_roll_deg(homography: Float, target: Target) -> float:
 
 
 def predict_px(target_mm: Float, centres_px: Float, homography: Float) -> Float:
-    """Where each marker (N, 2) belongs, by `to_image`; centres_px: NaN where unknown."""
+    """Predict where each marker (N, 2) belongs, by `to_image`; centres_px: NaN where unknown."""
     return make_image_map(target_mm, centres_px, homography)(target_mm)
 
 

@@ -79,7 +79,8 @@ def _find_nearest(points: Float, among: Index, place: Float) -> int:
 
 
 def _find_lattice_vectors(points: Float, near: Index) -> tuple[Float, Float] | None:
-    """To the nearest neighbour, and to the nearest of the next 8 that is well off that line; near[0] is the seed."""
+    """Find the vectors to the nearest neighbour, and to the nearest of the next 8 that is well off that line; near[0]
+    is the seed."""
     offset = points[near[1:10]] - points[near[0]]
     first = offset[0]
     for other in offset[1:]:

@@ -172,8 +172,8 @@ def compute_next_step(
 
 @compile_part
 def is_short(length_px: float, gain: float, is_near: bool) -> bool:
-    """Whether a step is the last one. gain: in variances of a pixel, less than one's share once all twelve parameters
-    have settled."""
+    """Return whether a step is the last one. gain: in variances of a pixel, less than one's share once all twelve
+    parameters have settled."""
     if is_near:
         return length_px < _SHORT_PX and gain < _SHORT_GAIN
     return length_px < _CONVERGED_PX and gain < 1
@@ -330,7 +330,7 @@ def limit_step(step: Float, p: Float, scale: float) -> Float:
 
 @compile_part
 def is_possible(p: Float, noise: Variance) -> bool:
-    """Whether the parameters are those of an ellipse with an edge that stands out of the noise."""
+    """Return whether the parameters are those of an ellipse with an edge that stands out of the noise."""
     edge = abs(p[B0] - p[F0]) > _LEAST_CONTRAST_SIGMA * math.sqrt(noise[0] + noise[1] * max(p[B0], 0.0))
     ellipse = p[M11] > 0 and p[M11] * p[M22] > p[M12] * p[M12]
     finite = True
@@ -341,7 +341,7 @@ def is_possible(p: Float, noise: Variance) -> bool:
 
 @compile_part
 def has_strayed(start: Float, p: Float, scale: float, radii: float) -> bool:
-    """Whether it is more than some radii from where it began, or more than twice or less than half the size."""
+    """Return whether it is more than some radii from where it began, or more than twice or less than half the size."""
     before, after = compute_half_extents(start, scale), compute_half_extents(p, scale)
     ratio_x, ratio_y = after[0] / before[0], after[1] / before[1]
     moved = math.hypot(p[CX] - start[CX], p[CY] - start[CY]) > radii * compute_mean_radius(start, scale)
@@ -350,7 +350,7 @@ def has_strayed(start: Float, p: Float, scale: float, radii: float) -> bool:
 
 @compile_part
 def has_moved_off(gathered_at: Float, p: Float, scale: float, band_sigma: float) -> bool:
-    """Whether the pixels gathered for one outline are not the right ones for another."""
+    """Return whether the pixels gathered for one outline are not the right ones for another."""
     before, after = compute_half_extents(gathered_at, scale), compute_half_extents(p, scale)
     moved = math.hypot(p[CX] - gathered_at[CX], p[CY] - gathered_at[CY])
     grown = max(abs(after[0] - before[0]), abs(after[1] - before[1]))
@@ -360,6 +360,6 @@ def has_moved_off(gathered_at: Float, p: Float, scale: float, band_sigma: float)
 
 @compile_part
 def compute_half_extents(p: Float, scale: float) -> tuple[float, float]:
-    """Half width and half height of the ellipse's bounding box, px."""
+    """Return half width and half height of the ellipse's bounding box, px."""
     determinant = p[M11] * p[M22] - p[M12] * p[M12]
     return scale * math.sqrt(p[M22] / determinant), scale * math.sqrt(p[M11] / determinant)

@@ -160,8 +160,8 @@ def gather(image: Picture, ellipse: Float, scale: float, limits: Limits, ceiling
 
 @compile_part
 def _set_ends(ends: Columns, cx: float, shape: Float, scale: float, y: float, limits: Limits) -> None:
-    """Where the parts of a row at height y begin, and the last one ends: into the ellipses, one inside the other, and
-    out of them again. A part is empty where the row misses its ellipse."""
+    """Set where the parts of a row at height y begin, and the last one ends: into the ellipses, one inside the other,
+    and out of them again. A part is empty where the row misses its ellipse."""
     begin, end = -(1 << 40), 1 << 40
     for i, F in enumerate((limits.ground, limits.core_out, limits.core_in, limits.disc)):
         first, last = _find_columns(cx, shape, scale, y, F)

@@ -79,7 +79,7 @@ def drop_strangers(kept: Bools, misfits: Float, greatest: float) -> None:
 
 @compile_part
 def _compute_median(values: Float) -> float:
-    """Of an even number of values."""
+    """Return the median of an even number of values."""
     ordered = values.copy()
     for i in range(1, len(ordered)):
         for j in range(i, 0, -1):
@@ -91,7 +91,7 @@ def _compute_median(values: Float) -> float:
 
 @compile_part
 def drop_worst(kept: Bools, misfits: Float, greatest: float) -> bool:
-    """Whether there were sectors to drop: the worst one above `greatest`, and those nearly as bad."""
+    """Return whether there were sectors to drop: the worst one above `greatest`, and those nearly as bad."""
     worst = 0.0
     for place in range(SECTORS):
         if kept[place]:

@@ -69,7 +69,7 @@ quadrant; its weights in that and in the next; how many rows."""
 
 @compile_part
 def count_clusters(radius_px: float) -> int:
-    """Into how many parts the quadrant is divided: there is a cluster about each end of a part."""
+    """Return into how many parts the quadrant is divided: each end of a part has a cluster about it."""
     return int(min(max(0.5 * math.pi * radius_px / _LEAST_ARC_px, _LEAST_CLUSTERS), MOST_CLUSTERS))
 
 
@@ -177,7 +177,7 @@ def compute_variance_ratio(scatter: Float, clean: NDArray[np.bool_]) -> tuple[Fl
 
 
 def compute_variance_growth(ratio: Float, chance: Float) -> Float:
-    """By what the variances of a frame's centres grow (2,), along x and y, for a `compute_variance_ratio`.
+    """Compute by what the variances of a frame's centres grow (2,), along x and y, for a `compute_variance_ratio`.
 
     Pulled to 1 where it could be chance (James and Stein): independent noise keeps the covariance that it has. To
     claim less than that takes twice the evidence.

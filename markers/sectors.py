@@ -127,7 +127,7 @@ def compute_sector_misfits(pixels: Pixels, p: Float) -> Float:
 
 @compile_part
 def _compute_mean_square(values: Float) -> float:
-    """Of those that are not NaN, 1 when all are."""
+    """Return the mean square of those that are not NaN, 1 when all are."""
     total, count = 0.0, 0
     for value in values:
         if not math.isnan(value):

@@ -172,7 +172,7 @@ class Target(Document):
 
     @property
     def spacing_mm(self) -> float:
-        """Between nearest neighbours, centre to centre."""
+        """The distance between nearest neighbours, centre to centre."""
         return self.pitch_mm * (math.sqrt(0.5) if self.layout == "staggered" else 1.0)
 
     def nominal_mm(self) -> NDArray[np.float64]:
@@ -205,7 +205,7 @@ class Target(Document):
 
     @property
     def hole_part(self) -> float:
-        """Which part of a donut marker's area is its hole; 0 when the target has none."""
+        """The part of a donut marker's area that is its hole; 0 when the target has none."""
         return (self.donut_markers.hole_mm / self.diameter_mm) ** 2 if self.donut_markers is not None else 0.0
 
     def is_donut(self) -> NDArray[np.bool_]:

@@ -45,7 +45,7 @@ def _compute_windows(
 
 
 def _compute_half_extents_px(homography: Float, target: Target) -> Float:
-    """Half width and half height of each marker's outline, (N, 2)."""
+    """Return half width and half height of each marker's outline, (N, 2)."""
     angle = np.arange(64) * (2 * np.pi / 64)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     outlines = target.coordinates_mm()[:, None] + target.diameters_mm()[:, None, None] / 2 * circle

@@ -208,9 +208,8 @@ def _find_run_end(whole: Int64, begin: int, cells: int) -> int:
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def _weigh(upper: Float32, lower: Float32, strip: _Cells, table: Float32, whole: Int64, weights: Float32) -> None:
-    """Of a strip's row of cells, whose corners have the offsets `upper` and `lower`: the whole pixels of each cell, and
-    of each column of pixels the weights in its first row (TAPS, pixels) and by what they grow from one row to the next
-    (TAPS, pixels)."""
+    """Compute the whole pixels of each cell of a strip's row, whose corners have the offsets `upper` and `lower`, and
+    for each column of pixels the weights in its first row (TAPS, pixels) and their change per row."""
     corners = np.empty((4, TAPS), np.float32)
     before, here, next_row = _NOWHERE, _AT(0), _AT(2)
     for cell in range(strip.cells):

@@ -259,7 +259,7 @@ def _wrap_in_braces(parts: Iterable[str], between: str = ", ") -> str:
 
 
 def _format_number(value: float) -> str:
-    """As C reads it, to the last bit."""
+    """Write a number as C reads it, to the last bit."""
     return ("-" if value < 0 else "") + "HUGE_VAL" if np.isinf(value) else repr(float(value))
 
 
@@ -301,6 +301,6 @@ def _read_template(name: str) -> str:
 
 
 def _format_version(model: DriftModel) -> str:
-    """Three numbers, as package.xml wants them."""
+    """Return the version as three numbers, as package.xml wants them."""
     parts = [part for part in model.facts.software_version.split(".") if part.isdecimal()]
     return ".".join([*parts, "0", "0", "0"][:3])

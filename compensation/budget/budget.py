@@ -163,7 +163,7 @@ class Repeatability:
 
 
 def measure_home_repeatability(events: Sequence[Event], unit: str) -> Repeatability:
-    """Where the axes that move in `unit` (mm or deg) found their homes, against where they expected them."""
+    """Measure where the axes that move in `unit` (mm or deg) found their homes, against where they expected them."""
     recorded = [
         event.data
         for event in events
@@ -476,7 +476,7 @@ def _make_repeat_lines(repeats: Repeatability, geometry: Geometry) -> list[Budge
 
 
 def _compute_target_radius_mm(target: Target) -> float:
-    """From the target's middle to its outermost marker."""
+    """Compute the distance from the target's middle to its outermost marker."""
     places = target.coordinates_mm()
     return float(np.linalg.norm(places - (places.min(axis=0) + places.max(axis=0)) / 2, axis=1).max())
 

@@ -205,7 +205,7 @@ class TableProblem(Problem[TableScene]):
     errors_sigma: Float
 
     def compute_own_priors(self, scene: TableScene) -> tuple[Float, Float]:
-        """Of the table's free errors."""
+        """Return the priors of the table's free errors."""
         own = (scene.errors / self.errors_sigma)[:, self.freed].ravel()
         return own, np.tile(1 / self.errors_sigma[self.freed], len(scene.errors))
 
@@ -403,7 +403,8 @@ class _Iteration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialGuess:
-    """Where an adjustment begins: Brown's camera and the table, with the corrections (P, N, 2), px, by homographies."""
+    """The place where an adjustment begins: Brown's camera and the table, with the corrections (P, N, 2), px, by
+    homographies."""
 
     scene: TableScene
     shifts_px: Float

@@ -124,7 +124,7 @@ def _fit_models(positions: Positions, board: Board, sigma: TableSigma) -> list[t
 
 
 def _score_held_out(lens: Lens, board: Board, held: Positions) -> list[float]:
-    """Mean square residual per coordinate, px^2, of each held-out position with enough markers."""
+    """Return the mean square residual per coordinate, px^2, of each held-out position with enough markers."""
     found: list[float] = []
     for centres, covariance in zip(held.centres_px, held.covariance_px2, strict=True):
         inside = _find_usable_markers(lens, centres)
@@ -154,7 +154,7 @@ def _summarise_squares(model: str, squares: Float) -> ModelScore:
 
 
 class Model(StrEnum):
-    """Which pinhole to use. AUTO: the one that does better at positions it was not fitted to."""
+    """The choice of a pinhole model. AUTO: the one that does better at positions it was not fitted to."""
 
     AUTO = "auto"
     BROWN = "brown"

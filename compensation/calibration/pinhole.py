@@ -132,7 +132,7 @@ class Pinhole:
         return np.where(((off < 1e-10) & upright)[..., None], slopes, np.nan)
 
     def compute_misfit(self, points_mm: Float, pixels: Float) -> Float:
-        """Where points (..., 3) are seen, minus where they should be, px."""
+        """Return where points (..., 3) are seen, minus where they should be, px."""
         return self.project(points_mm) - pixels
 
     def compute_point_jacobian(self, points_mm: Float, pixels: Float) -> Float:

@@ -57,7 +57,7 @@ class Pose:
     chi: float
 
     def locate_point_mm(self, point_mm: Float) -> Float:
-        """Where a point (3,) of the target is in the camera's frame, mm."""
+        """Return where a point (3,) of the target is in the camera's frame, mm."""
         return self.rotation @ point_mm + self.translation_mm
 
     def compute_covariance(self, point_mm: Float) -> Float:

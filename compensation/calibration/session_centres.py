@@ -38,7 +38,7 @@ class MeanCentres:
 
 
 def average_centres(centres_px: Float, covariance_px2: Float) -> MeanCentres:
-    """Of frames' centres (F, N, 2) and covariances (F, N, 2, 2); NaN where a frame lacks a marker."""
+    """Average frames' centres (F, N, 2) with covariances (F, N, 2, 2), which are NaN where a frame lacks a marker."""
     good = np.isfinite(centres_px[:, :, 0])
     information = np.zeros_like(covariance_px2)
     information[good] = np.linalg.inv(covariance_px2[good])
@@ -97,7 +97,7 @@ def list_visits(steps: Sequence[StepMark], roles: Collection[str]) -> dict[str, 
 
 
 def read_position(session: Session, axis: Axis, visit: TableVisit) -> float:
-    """Mean of what the axis reported at rest during the visit, else where it was sent; mm or deg."""
+    """Return the mean of what the axis reported at rest during the visit, else where it was sent; mm or deg."""
     try:
         times_ns, values = session.readings(f"{axis}.position")
         moving_ns, moving = session.readings(f"{axis}.moving")
@@ -130,7 +130,7 @@ class Views:
 
     @property
     def variance_px2(self) -> float:
-        """Of a coordinate, mean over all markers."""
+        """The variance of a coordinate, as the mean over all markers."""
         return float(np.nanmean(np.diagonal(self.covariance_px2, axis1=2, axis2=3)))
 
     def select(self, chosen: NDArray[np.bool_]) -> Self:

@@ -80,7 +80,7 @@ def validate_session(
 
 
 def _choose_numbers_path(page: Path) -> Path:
-    """Where the numbers go; ConfigError when that is the page, or one of the two cannot be written."""
+    """Return where the numbers are written; ConfigError when that is the page, or one of the two cannot be written."""
     numbers_path = page.with_suffix(".json")
     if numbers_path == page:
         raise ConfigError(f"{page}: the page is HTML, and a JSON file is written next to it; name it .html")

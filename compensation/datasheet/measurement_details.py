@@ -46,5 +46,5 @@ class MeasurementDetails(Document):
 
 
 def load_details(path: Path | None) -> MeasurementDetails:
-    """Of a file, or nothing stated; ConfigError that names what is wrong in it."""
+    """Load the details of a file, or none when no file is given; ConfigError names what is wrong in it."""
     return MeasurementDetails() if path is None else load_document(path, MeasurementDetails)

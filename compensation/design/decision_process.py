@@ -46,7 +46,7 @@ def decide_next_visit(session: str, asked: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def prepare() -> None:
-    """As a process of its own."""
+    """Prepare the process that decides: one thread in each library, and a low priority."""
     for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
     lower_priority()

@@ -89,7 +89,7 @@ class ForecastState:
     states: States
 
     def where(self, rows: NDArray[np.int64]) -> ForecastState:
-        """These situations, in this order."""
+        """Return these situations, in this order."""
         return ForecastState(
             self.target_degC[rows], self.air_degC[rows], self.camera_lags[rows], self.states.where(rows)
         )
@@ -129,7 +129,7 @@ def _fit_air_response(observations: Observations) -> Float:
 
 
 def read_current_state(observations: Observations, memory: ThermalStateSpec) -> ForecastState:
-    """At the last frame of the last session."""
+    """Return the camera's state at the last frame of the last session."""
     history = observations.histories[-1]
     own = observations.session == len(observations.sessions) - 1
     at_ns, recorded_degC = observations.time_ns[own][-1:], observations.camera_degC[own][-1:]
@@ -139,7 +139,8 @@ def read_current_state(observations: Observations, memory: ThermalStateSpec) -> 
 
 
 def compute_equilibrium(around: CameraSurroundings, set_points_degC: Float, memory: ThermalStateSpec) -> ForecastState:
-    """Of a powered camera after a long time at set-points (S,); plays are as after a way from a colder place."""
+    """Compute the state of a powered camera after a long time at set-points (S,); plays are as after a way from a
+    colder place."""
     air = around.air_degC(set_points_degC)
     lags = np.repeat(air[:, None], len(_AIR_LAGS), axis=1)
     follower = Follower(memory.parts)
@@ -150,14 +151,14 @@ def compute_equilibrium(around: CameraSurroundings, set_points_degC: Float, memo
 
 
 def _make_states(memory: ThermalStateSpec, values: Sequence[Float]) -> States:
-    """Of a camera that has been on, and followed, for long."""
+    """Make the states of a camera that has been on, and followed, for long."""
     return States(memory, np.column_stack([*values, *np.full((2, len(values[0])), np.inf)]))
 
 
 def forecast(
     around: CameraSurroundings, situation: ForecastState, set_points_degC: Float, soak_s: Float
 ) -> ForecastState:
-    """After dwells (S,) at set-points (S,), s and degC."""
+    """Compute the states after dwells (S,) at set-points (S,), s and degC."""
     goal, memory = around.air_degC(set_points_degC), situation.states.memory
     left_s = np.asarray(soak_s, np.float64).copy()
     target, air, values = situation.target_degC, situation.air_degC, [*situation.states.columns]
@@ -181,7 +182,7 @@ def forecast(
 
 
 def _advance_follower(follower: Follower, now: list[Float], mean: list[Float], dt_s: Float) -> list[Float]:
-    """After dt_s (S, 1), with these inputs now and in the mean."""
+    """Advance a lag by dt_s (S, 1), with its inputs now and in the mean."""
     follower.follow(now, [*mean, *now[3:]], (-np.expm1(-dt_s / follower.taus_s)).T, np.clip)
     return now
 
@@ -195,8 +196,8 @@ _TIME_AT_SET_POINT_S: dict[WantedState, float] = {"at_rest": 4 * 3600.0, "on_the
 def list_wanted_states(
     around: CameraSurroundings, memory: ThermalStateSpec, range_degC: tuple[float, float], kinds: Sequence[WantedState]
 ) -> ForecastState:
-    """Of a powered camera throughout the range: so long after it was brought there from rest in the middle, or half way
-    to either end. Both ways to a temperature and what creeps are in these. ValueError without a kind."""
+    """List states of a powered camera throughout the range: so long after it was brought there from rest in the middle,
+    or half way to either end. Both ways to a temperature and what creeps are in these. ValueError without a kind."""
     low, high = range_degC
     pairs = np.array(list(product(np.linspace(low, high, 5)[1:4], np.linspace(low, high, _PLACES))))
     begun = compute_equilibrium(around, pairs[:, 0], memory)
@@ -242,8 +243,8 @@ def find_best_course(
     soaks_s: Sequence[float],
     seed: int,
 ) -> BestCourse:
-    """Of courses of each dwell, about as long together: the one after which the mean variance over the wanted states is
-    least. The same for a seed."""
+    """Choose, among courses of each dwell that take about as long together, the one after which the mean variance over
+    the wanted states is least. The same for a seed."""
     rng = np.random.default_rng([20, seed])
     moment = known.wanted.T @ known.wanted / len(known.wanted)
     best: BestCourse | None = None
@@ -413,7 +414,7 @@ def _make_grid(wanted: DesignGoal) -> Float:
 
 
 def _has_few_interior_set_points(observations: Observations) -> bool:
-    """Whether too few set-points lie between others for what the model leaves at such ones."""
+    """Return whether too few set-points lie between others for what the model leaves at such ones."""
     # With fewer, the set-points that are left out are those at the ends, and a model claimed 100 to 700 mpx.
     return len(_list_fitted_set_points(observations)) - 2 < FEWEST_BETWEEN
 

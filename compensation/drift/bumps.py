@@ -182,8 +182,8 @@ class SessionSeries:
         return np.searchsorted(self.first_ns, np.array(before_ns, np.int64))
 
     def refine(self, before: int) -> SessionSeries:
-        """With each minute an instant of its own on both sides of the boundary before this instant; the same series
-        where that is so already."""
+        """Return the series with each minute an instant of its own on both sides of the boundary before this instant;
+        the same series where that is so already."""
         frames = self._frames
         near = (frames.label == before - 1) | (frames.label == before)
         minute = frames.observations.time_ns[frames.rows.frame] // _INSTANT_NS
@@ -336,8 +336,8 @@ def find_bumps(observations: Observations) -> tuple[Bump, ...]:
 
 
 def correct_bumps(observations: Observations, bumps: tuple[Bump, ...]) -> Observations:
-    """With the centres where they would be had the camera stayed as it was when its reference was taken; each centre
-    that was moved back has the step's variance, too."""
+    """Return the observations with the centres where they would be had the camera stayed as it was when its reference
+    was taken; each centre that was moved back has the step's variance, too."""
     centres, covariance = observations.centres_px.copy(), observations.covariance_px2.copy()
     for bump in bumps:
         for index, facts in enumerate(observations.sessions):
@@ -459,8 +459,8 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class UnrepeatedMotion:
-    """Of one session. cause: what it is like. along_px, across_px: RMS along the line on which most is left, and across
-    it; direction_deg: of that line, from I towards J, -90..90. text: in a sentence."""
+    """How far one session's drift does not repeat. cause: what it is like. along_px, across_px: RMS along the line on
+    which most is left, and across it; direction_deg: of that line, from I towards J, -90..90. text: in a sentence."""
 
     session_id: str
     cause: Cause

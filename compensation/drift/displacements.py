@@ -53,8 +53,8 @@ def find_reference_frames(observations: Observations) -> Mask:
 
 
 def average_reference_centres(observations: Observations, frames: Mask | None = None) -> tuple[Float, Float]:
-    """Mean centres (S, N, 2) and their variance (S, N, 2) over each session's own `frames` (F,), by default its
-    REFERENCE frames; NaN without any.
+    """Average the centres (S, N, 2), with their variance (S, N, 2), over each session's own `frames` (F,), by default
+    its REFERENCE frames; NaN without any.
 
     Each session has a reference of its own: between sessions the target may have been moved.
     """

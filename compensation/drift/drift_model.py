@@ -69,7 +69,8 @@ class DriftModel(ABC):
         it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
 
     def correct(self, xy_px: Float, state: Situation) -> Float:
-        """Where the points (N, 2), px, would be at the reference; NaN where a point, or one of several states, is NaN.
+        """Return where the points (N, 2), px, would be at the reference; NaN where a point, or one of several states,
+        is NaN.
 
         ValueError when not a single point has an answer, as in states that are not known.
         """

@@ -25,8 +25,8 @@ def compute_convex_hull(points: Float) -> Float:
 
 
 def is_area(hull_px: Float) -> bool:
-    """Whether the corners (H, 2) are those of a convex polygon, in the sense that turns x towards y, and not so thin
-    that it may be a line."""
+    """Return whether the corners (H, 2) are those of a convex polygon, in the sense that turns x towards y, and not so
+    thin that it may be a line."""
     sides = np.linalg.norm(np.roll(hull_px, -1, axis=0) - hull_px, axis=1)
     if len(hull_px) < 3 or sides.min() == 0:
         return False

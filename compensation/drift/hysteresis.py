@@ -38,8 +38,8 @@ class BranchDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hysteresis:
-    """Of one session. range_px (2,): of the whole drift. largest_px, rms_px (2,): of the gaps along I and J, NaN
-    without any. area_px_K (2,): the integral of the absolute gap over the set-points, 0 with fewer than two.
+    """The hysteresis of one session. range_px (2,): of the whole drift. largest_px, rms_px (2,): of the gaps along I
+    and J, NaN without any. area_px_K (2,): the integral of the absolute gap over the set-points, 0 with fewer than two.
     closure_px (2,): last visit of the reference set-point minus the first, NaN when there was only one.
     repeatability_px (2,): standard deviation of visits of the same set-point from the same side, NaN when none was
     repeated. gaps: of each set-point that was reached from below and from above."""
@@ -97,7 +97,7 @@ def _collect_visits(observations: Observations, own: Mask, model: DriftModel | N
 
 
 def _average_frames(values: Float, variance: Float) -> tuple[Float, Float]:
-    """Over the frames that have the marker."""
+    """Average a marker's centres over the frames that have it."""
     count = np.isfinite(values).sum(axis=0)
     safe = np.maximum(count, 1)
     mean = np.where(count > 0, np.nansum(values, axis=0) / safe, np.nan)

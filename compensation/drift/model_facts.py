@@ -45,7 +45,7 @@ class Bump(Document):
 
     @property
     def text(self) -> str:
-        """Who moved how far, in a sentence without its time."""
+        """The bump in a sentence without its time: which part moved, and how far."""
         if self.marker is not None:
             who = f"marker {self.marker} moved"
         else:
@@ -88,8 +88,8 @@ class ModelFacts:
 def collect_facts(
     observations: Observations, rows: Displacements, camera_range_degC: Pair, reference_degC: float
 ) -> ModelFacts:
-    """Of a model fitted to the set-point `rows` of these observations; SessionError when the markers lie in one line,
-    or the sessions have different reference temperatures."""
+    """Collect the facts of a model fitted to the set-point `rows` of these observations; SessionError when the markers
+    lie in one line, or the sessions have different reference temperatures."""
     hull_px = compute_convex_hull(rows.measured_px)
     if not is_area(hull_px):
         raise SessionError("the markers lie in one line; a model of the image needs an area of them")

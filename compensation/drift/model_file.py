@@ -92,7 +92,7 @@ class PaperFile(_File):
 
 
 def _serialise_term(term: Term) -> dict[str, object]:
-    """Its kind and parameters, as terms.term_of takes them."""
+    """Return a term's kind and parameters, as terms.term_of takes them."""
     return {"kind": term.kind, **term.model_dump()}
 
 

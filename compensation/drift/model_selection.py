@@ -118,7 +118,7 @@ def _score_transient_frames(observations: Observations, paper: PaperModel, therm
 
 
 def select_better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
-    """By the squares at what was left out; each gets the table with the rows of both."""
+    """Choose the model with the smaller squares at what was left out; each gets the table with the rows of both."""
     both = paper.candidates + thermal.candidates
     in_use = [next(one for one in model.candidates if one.chosen) for model in (paper, thermal)]
     of_paper, of_thermal = in_use

@@ -165,7 +165,7 @@ class PaperModel(DriftModel):
 
     @property
     def scaling(self) -> Scaling:
-        """Of image and calibrated temperature range."""
+        """The scales of image and calibrated temperature range, by which the polynomial's variables are divided."""
         return Scaling(self.facts.image_size, self.facts.camera_range_degC)
 
     @property
@@ -174,7 +174,7 @@ class PaperModel(DriftModel):
         return f"degree {self.degree}, {self.score.terms} terms, condition {self.score.condition:.0f}"
 
     def shift(self, xy_px: Float, state: Situation) -> Float:
-        """As in DriftModel."""
+        """Predict the drift, as DriftModel.shift states."""
         return self._build_terms(xy_px, state) @ self.coefficients.T
 
     def covariance(self, xy_px: Float, state: Situation) -> Float:

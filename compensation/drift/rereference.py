@@ -82,7 +82,7 @@ def fit_like(observations: Observations, units: Sequence[ThermalModel]) -> Therm
 
 
 def _pool_coefficients(units: Sequence[ThermalModel]) -> tuple[Float, Float]:
-    """Mean (8, H) and covariance (8, H, H) of the coefficients of a unit that nothing is known of."""
+    """Return mean (8, H) and covariance (8, H, H) of the coefficients of a unit that nothing is known of."""
     each = np.array([one.coefficients for one in units])
     mean, count = each.mean(axis=0), len(each)
     scatter = np.einsum("kmg,kmh->mgh", each - mean, each - mean) * (1 + 1 / count) / (count - 1)

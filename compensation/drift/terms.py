@@ -196,9 +196,9 @@ class BacklashTerm(Term):
 
 
 class HiddenBacklashTerm(Term):
-    """Of a part between air and camera that nobody measures, as a mount: it follows both late, and has a share of the
-    camera's excess over the air. A dead zone in a mount moves the image by where the mount came from, which is no play
-    of the chip's temperature: switching on heats the chip by 15 K and the mount by 3."""
+    """The backlash of a part between air and camera that nobody measures, as a mount: it follows both late, and has a
+    share of the camera's excess over the air. A dead zone in a mount moves the image by where the mount came from,
+    which is no play of the chip's temperature: switching on heats the chip by 15 K and the mount by 3."""
 
     kind = "part play"
     title = "plays of parts"

@@ -73,7 +73,8 @@ class _OuNoiseModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hyperparameters:
-    """Of one motion. widths (H,): of the prior, noise: of an instant, both in units of the noise that markers have."""
+    """The hyperparameters of one motion. widths (H,): of the prior, noise: of an instant, both in units of the noise
+    that markers have."""
 
     weighting: _OuNoiseModel
     widths: Float
@@ -149,7 +150,7 @@ def _iterate_noise_models(instants: Instants, variance: Float) -> Iterator[_OuNo
 def _build_normal_equations(
     features: Float, amounts: Float, weighting: _OuNoiseModel, left_out: Index | None = None
 ) -> _NormalEquations:
-    """Without the instants that are left out: the precision of the others is B - B_rf B_ff^-1 B_fr."""
+    """Return the precision of the other instants without those that are left out: B - B_rf B_ff^-1 B_fr."""
     weighted, projected = weighting.precision @ features, weighting.precision @ amounts
     gram, moment, square = features.T @ weighted, features.T @ projected, (amounts * projected).sum(axis=0)
     count = len(features)
@@ -303,8 +304,8 @@ def _compute_left_out_sessions(taught: _ThermalFit) -> Float:
 
 
 def _is_covered_by_others(chamber_degC: Float, session_index: Float, index: float) -> bool:
-    """Whether the other sessions were at all set-points of this one, and at most of all: otherwise a fit without it has
-    to extrapolate."""
+    """Return whether the other sessions were at all set-points of this one, and at most of all: otherwise a fit without
+    it has to extrapolate."""
     own, others = set(chamber_degC[session_index == index].tolist()), set(chamber_degC[session_index != index].tolist())
     return bool(own) and own <= others and len(others) >= _MOST_OF * len(own | others)
 

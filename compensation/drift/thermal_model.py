@@ -91,7 +91,7 @@ class ThermalModel(DriftModel):
         return Origin(self.facts.reference_degC, self.reference_ambient_degC)
 
     def shift(self, xy_px: Float, state: Situation) -> Float:
-        """As in DriftModel."""
+        """Predict the drift, as DriftModel.shift states."""
         amounts = self._compute_features(state, len(xy_px)) @ self.coefficients.T
         return np.einsum("nak,nk->na", compute_motions(xy_px, self.facts.image_size), amounts)
 

@@ -31,7 +31,7 @@ from thermostand.recording.format.records import FramePlace, read_frame_crcs
 
 
 def get_cache_folder() -> Path:
-    """Where found markers are kept."""
+    """Return where found markers are kept."""
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "thermostand" / "markers"
 

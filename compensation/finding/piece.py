@@ -54,7 +54,7 @@ class Piece:
     noise: Noise | None
 
     def select_places(self, places: Sequence[FramePlace]) -> list[FramePlace]:
-        """Its own among the segment's frames, which are in order of time."""
+        """Return this piece's own places among the segment's frames, which are in order of time."""
         own = [place for place in places if place.meta.channel == self.channel]
         return own[self.first : self.first + self.frames]
 
@@ -138,7 +138,7 @@ def concatenate_markers(parts: list[FoundMarkers]) -> FoundMarkers:
 
 
 def _read_frame_image(place: FramePlace) -> ImageArray:
-    """Its pixels; SessionError, with the frame's time, when it cannot be read."""
+    """Read a frame's pixels; SessionError, with the frame's time, when it cannot be read."""
     with _name_frame_in_errors(place):
         return decode_image(read_frame(place).image)
 

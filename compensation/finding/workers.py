@@ -34,7 +34,7 @@ def find_in_turn(pieces: Sequence[Piece]) -> Iterator[tuple[int, FoundMarkers]]:
 
 
 def make_process_work(workers: int) -> Work:
-    """So many processes, each with one thread. What a process that was killed had not finished is done again by
+    """Start so many processes, each with one thread. What a process that was killed had not finished is done again by
     another; SessionError when that does not help.
 
     The process that they are forked from loads what they need from now on, while this one makes the pieces."""
@@ -65,7 +65,7 @@ def make_process_work(workers: int) -> Work:
 def _iterate_finished(
     processes: ProcessPoolExecutor, folder: str, pieces: Sequence[Piece], indices: Iterable[int]
 ) -> Iterator[tuple[int, FoundMarkers]]:
-    """As they are finished, also those that were when the pool broke."""
+    """Iterate over results as they are finished, also those that were when the pool broke."""
     waiting: dict[Future[str], int] = {
         processes.submit(find_to_file, pieces[index], folder): index for index in indices
     }

@@ -41,12 +41,12 @@ class ThermalStateSpec:
 
     @property
     def at(self) -> dict[Any, int]:
-        """Where in a state's values each input, lag and play is."""
+        """The place of each input, lag and play in a state's values."""
         return {part: place for place, part in enumerate((*INPUTS, *self.parts))}
 
     @property
     def longest_s(self) -> float:
-        """Its longest time constant; 0 without one."""
+        """The longest time constant; 0 without one."""
         return max((tau_s for kind, _, tau_s in self.parts if kind == "lag"), default=0.0)
 
     @property
@@ -65,7 +65,7 @@ class States:
 
     @classmethod
     def at_degC(cls, camera_degC: float | Float, count: int, memory: ThermalStateSpec | None = None) -> States:
-        """Nothing but the camera's temperature is known, one or (F,), at `count` instants."""
+        """Make states at `count` instants of which nothing but the camera's temperature is known, one or (F,)."""
         memory = memory or ThermalStateSpec()
         rows = np.full((count, len(memory.at) + 2), np.nan)
         rows[:, 0] = camera_degC
@@ -169,7 +169,7 @@ def _cut_at(column: tuple[TimesNs, Float], until_ns: int) -> tuple[TimesNs, Floa
 
 
 def refine_temperature(history: ThermalHistory) -> ThermalHistory:
-    """With the camera's temperature between the steps of its display.
+    """Return the history with the camera's temperature between the steps of its display.
 
     Many cameras show theirs in quarters of a degree, at which the image moves by several mpx. Where the display changes
     the temperature is half way between its steps. In between runs a linear function of lags of ambient and power,
@@ -290,8 +290,8 @@ def _interpolate_camera(history: ThermalHistory, marks_ns: TimesNs, time_ns: Tim
 
 
 def _average_between(history: ThermalHistory, marks_ns: TimesNs) -> tuple[Float, Float]:
-    """Mean ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where the
-    they are not recorded."""
+    """Average ambient, by the trapezoidal rule, and powered share between the marks (M,), (M - 1,) each; NaN where they
+    are not recorded."""
     ambient = interpolate(history.ambient_ns, history.ambient_degC, marks_ns, GAP_NS)
     return (ambient[1:] + ambient[:-1]) / 2, _compute_powered_share(history, marks_ns)
 

@@ -101,12 +101,12 @@ def fit_and_evaluate(observations: Observations) -> tuple[DriftModel | None, Eva
 
 
 def can_be_fitted(observations: Observations) -> bool:
-    """Whether there are a reference and set-points to fit; without them a report shows the drift alone."""
+    """Return whether there are a reference and set-points to fit; without them a report shows the drift alone."""
     return can_be_scored(observations) and bool(observations.of(Role.FIT).any())
 
 
 def can_be_scored(observations: Observations) -> bool:
-    """Whether a model can be compared with frames at set-points, from a reference on."""
+    """Return whether a model can be compared with frames at set-points, from a reference on."""
     reference, set_points = observations.of(Role.REFERENCE), observations.of(Role.FIT, Role.VALIDATION)
     return bool(reference.any() and set_points.any())
 

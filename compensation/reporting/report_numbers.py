@@ -481,7 +481,7 @@ def typeset(text: str) -> str:
 
 
 def format_compact(value: float, u: float) -> str:
-    """As 0.0611(81): the digits in brackets are the standard uncertainty of the last ones."""
+    """Write a value as 0.0611(81): the digits in brackets are the standard uncertainty of the last ones."""
     if not u > 0 or not math.isfinite(value):
         return f"{value:.4g}"
     text, uncertain = format_with_expanded_uncertainty(value, u)

@@ -92,7 +92,7 @@ def compute_displacement_px(observations: Observations) -> Float:
 
 
 def _is_near(moved: Float) -> bool:
-    """Whether markers (N, 2) are about where they should be; not known to be elsewhere is near."""
+    """Return whether markers (N, 2) are about where they should be; not known to be elsewhere is near."""
     lengths = np.linalg.norm(moved, axis=1)
     lengths = lengths[np.isfinite(lengths)]
     return len(lengths) > 0 and float(np.median(lengths)) < _ELSEWHERE_PX
@@ -128,7 +128,7 @@ def _make_warm_up_track(observations: Observations, frames: Rows) -> WarmUpTrack
 
 
 def _compute_roll_deg(observations: Observations, start_px: Float) -> float:
-    """From the directions between the same markers in the first usable frame and here."""
+    """Compute the roll from the directions between the same markers in the first usable frame and here."""
     first = observations.centres_px[int(np.argmax(observations.usable))]
     both = np.isfinite(first).all(axis=1) & np.isfinite(start_px).all(axis=1)
     if both.sum() < 2:
@@ -171,5 +171,5 @@ def average_over_markers(values: Float) -> Float:
 
 
 def thin(count: int, limit: int) -> Rows:
-    """At most `limit` of `count` places, evenly, with the first and the last."""
+    """Choose at most `limit` of `count` places, evenly, with the first and the last."""
     return np.unique(np.round(np.linspace(0, count - 1, min(count, limit))).astype(np.int64))

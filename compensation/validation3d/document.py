@@ -63,7 +63,8 @@ TABLE_1 = (
 
 
 def format_summary(validation: SpatialValidation) -> str:
-    """Mean absolute deviation along X, Y, Z with its standard uncertainty, for every variant; rotation and table."""
+    """Write the mean absolute deviation along X, Y, Z with its standard uncertainty, for every variant; rotation and
+    table."""
     width = max(len(one.name) for one in validation.variants) + 2
     where = " (simulated)" if validation.simulated else ""
     lines = [
@@ -138,7 +139,7 @@ class _PaperMean(Document):
 
 
 class _Result(Document):
-    """Of a variant: arrays are [temperature][position][X, Y, Z]; temperature 0 is the reference."""
+    """The result of a variant: arrays are [temperature][position][X, Y, Z]; temperature 0 is the reference."""
 
     name: str
     mean_um: _Row

@@ -315,8 +315,8 @@ def compute_deviations(
     model_px2: Float | None = None,
     errors_px: Float | None = None,
 ) -> Deviations:
-    """Of centres (F, N, 2), which may be corrected. model_px2 (F, N, 2, 2), errors_px (V, F, N, 2): of the corrections,
-    as CentreUncertainty has them.
+    """Compute the deviations in space from centres (F, N, 2), which may be corrected. model_px2 (F, N, 2, 2), errors_px
+    (V, F, N, 2): of the corrections, as CentreUncertainty has them.
 
     The frames of a position at a temperature are averaged first. CalibrationError when V0, V1, ... at the reference
     have no pose.
@@ -345,7 +345,7 @@ def _average_uncertainty(indices: FrameIndices, model_px2: Float | None, errors_
 
 
 def _average_centres(observations: Observations, centres_px: Float, indices: FrameIndices) -> MeanCentres | None:
-    """None when too few markers are left for a pose that can be judged."""
+    """Average the centres of frames; None when too few markers are left for a pose that can be judged."""
     mean = average_centres(centres_px[indices], observations.covariance_px2[indices]) if len(indices) else None
     if mean is None or np.count_nonzero(np.isfinite(mean.centres_px[:, 0])) < _LEAST_MARKERS:
         return None
@@ -413,7 +413,7 @@ def _estimate_table_um(repeats: list[_PoseDifference]) -> Float:
 
 
 def _average_known(values: Float, axis: int) -> Float:
-    """Mean of what is known; NaN where nothing is."""
+    """Average what is known; NaN where nothing is."""
     known = np.isfinite(values)
     count = known.sum(axis=axis)
     return np.where(count > 0, np.where(known, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
@@ -521,7 +521,7 @@ class SpatialValidation:
 
     @property
     def variants(self) -> tuple[Deviations, ...]:
-        """Those that there are, in order."""
+        """The variants that were computed, in order."""
         return tuple(one for one in (self.before, self.after, self.camera_alone, self.with_stand) if one is not None)
 
 

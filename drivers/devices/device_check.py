@@ -106,7 +106,7 @@ class DeviceCheck:
         return {reading.channel.partition(".")[2]: reading.value for reading in readings}
 
     async def check_points(self, used: Iterable[str] | None = None) -> None:
-        """Of a unit on the bus that answers: the points of its register map that were never seen on a unit; those of
+        """Check a unit on the bus that answers: the points of its register map that were never seen on a unit; those of
         `used` only, when given."""
         if self.name in self.opened:
             for finding in await check_unverified_points(
@@ -115,7 +115,7 @@ class DeviceCheck:
                 self.add(finding)
 
     def _advice(self, error: DeviceError) -> str:
-        """Of a unit on the bus it is the line that matters most."""
+        """Return what to look at; for a unit on the bus it is the line that matters most."""
         if not isinstance(self.settings, OnBus):
             return self.advise(error)
         bus, unit = self.of_section("bus"), self.settings
@@ -136,8 +136,8 @@ async def check_answers(look: DeviceCheck) -> None:
 
 
 async def check_controller(look: DeviceCheck) -> None:
-    """Of what holds the chamber's temperature: whether what is written to it is what it goes to, and how that is known;
-    and that nothing controls now."""
+    """Check what holds the chamber's temperature: whether what is written to it is what it goes to, and how that is
+    known; and that nothing controls now."""
     readings = await look.open_and_read()
     if isinstance(look.settings, OnBus):
         await look.check_points()

@@ -60,7 +60,7 @@ class Inputs:
 
     @property
     def identity(self) -> Identity | None:
-        """Which unit has answered; None before `open`."""
+        """The unit that has answered; None before `open`."""
         return self._unit.identity
 
     async def open(self) -> None:
@@ -94,7 +94,7 @@ def _make(name: str, settings: InputsSettings, around: DriverContext) -> Inputs:
 
 
 async def _check(look: DeviceCheck) -> None:
-    """Whether each contact is as it is while all is well."""
+    """Return whether each contact is as it is while all is well."""
     readings = await look.open_and_read()
     for name, contact in look.settings.contacts.items():
         closed = readings.get(name)

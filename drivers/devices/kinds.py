@@ -55,8 +55,8 @@ class DriverContext:
 
 
 class LockedPlace(NamedTuple):
-    """Where a device is found, which no two runs may use at once. wire: a serial or TCP address; host: of what answers
-    at one; number: what a real device is known by wherever it is; name: as it is."""
+    """A place where a device is found, which no two runs may use at once. wire: a serial or TCP address; host: of what
+    answers at one; number: what a real device is known by wherever it is; name: as it is."""
 
     how: Literal["wire", "host", "number", "name"]
     text: str
@@ -203,7 +203,7 @@ class DeviceKind:
     fakes: tuple[str, ...] | None = None
 
     def fake(self, settings: Any) -> str:
-        """By what the simulated laboratory has it; "" where it has nothing of it."""
+        """The kind by which the simulated laboratory has it; "" where it has nothing of it."""
         fakes = (self.section if self.section != ADDED else self.name,) if self.fakes is None else self.fakes
         of_protocol = f"{self.section}.{getattr(settings, 'protocol', '')}"
         return of_protocol if of_protocol in fakes else next(iter(fakes), "")

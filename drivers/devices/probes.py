@@ -103,7 +103,7 @@ class Probe:
         )
 
     async def open(self) -> None:
-        """Which unit answers; Refused when it is another one."""
+        """Open it, and return which unit answers; Refused when it is another one."""
         if self._worker is None:
             self._worker = WorkerThread(self.name, self._clock)
         await self.read()

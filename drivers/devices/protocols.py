@@ -19,7 +19,7 @@ class Device(Protocol):
 
     @property
     def identity(self) -> Identity | None:
-        """Which device has answered; None while that is not known, and where there is no device to ask."""
+        """The device that has answered; None while that is not known, or when no device can be asked."""
         ...
 
     async def open(self) -> None:
@@ -50,9 +50,9 @@ class Actuator(Device, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """Whether the set-point that was written is the one that acts: what a controller says of it. It can be written and
-    read back and yet not be what the unit goes to: another set-point bank, a remote set-point, a sensor outside, a
-    program, a ramp, an operator at the panel, degrees Fahrenheit.
+    """What a controller says of whether the set-point that was written is the one that acts. It can be written and read
+    back and yet not be what the unit goes to: another set-point bank, a remote set-point, a sensor outside, a program,
+    a ramp, an operator at the panel, degrees Fahrenheit.
 
     known_by: the registers or queries that tell it; "" when none does. not_reported: what they leave open; "" for
     nothing. objections: a sentence for each thing that acts in its place, with what to do; () while it is in force."""
@@ -68,7 +68,7 @@ class Controller(Sensor, Actuator, Protocol):
     fault at each `read`, and keeps `set_temperature` and `run` from being obeyed: DeviceFault."""
 
     async def in_force(self) -> InForce:
-        """Whether the set-point that it has is the one that acts, as it tells now; raises DeviceError."""
+        """Return whether the set-point that it has is the one that acts, as it tells now; raises DeviceError."""
         ...
 
     async def set_temperature(self, degC: float) -> None:
@@ -122,11 +122,11 @@ class HeatOutput(Protocol):
         ...
 
     async def off(self) -> None:
-        """No heat, confirmed; DeviceError."""
+        """Stop all heat and confirm it; DeviceError when that fails."""
         ...
 
     async def test_dead_man(self) -> None:
-        """Whether it ends by itself, without heating; DeviceFault when not."""
+        """Return whether it ends by itself, without heating; DeviceFault when not."""
         ...
 
 
@@ -144,7 +144,7 @@ class Shutter(Sensor, Actuator, Protocol):
         ...
 
     def allow(self) -> None:
-        """New commands may move it again after it was made safe."""
+        """Allow new commands to move it again after it was made safe."""
         ...
 
 
@@ -162,7 +162,7 @@ class Camera(Sensor, Protocol):
 
     @property
     def identity(self) -> Identity:
-        """Which camera has answered; Unreachable before `open`."""
+        """The camera that has answered; Unreachable before `open`."""
         ...
 
     @property
@@ -176,5 +176,6 @@ class Camera(Sensor, Protocol):
         ...
 
     async def describe_temperature_place(self) -> str:
-        """Where its temperature is read, and what else the camera offers, in words; "" when nothing was found."""
+        """Return where its temperature is read, and what else the camera offers, in words; "" when nothing was
+        found."""
         ...

@@ -73,7 +73,7 @@ class Relays:
 
     @property
     def identity(self) -> Identity | None:
-        """Which board has answered; None before `open`."""
+        """The board that has answered; None before `open`."""
         return self._unit.identity
 
     async def open(self) -> None:
@@ -175,7 +175,7 @@ class NoRelays:
         """Do nothing: there is no device to connect to."""
 
     async def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: it holds no line."""
 
     async def read(self) -> tuple[Reading, ...]:
         """heater_enable, compressor, camera_power; 1 on, 0 off."""

@@ -126,7 +126,7 @@ class Thermometers:
 
     @property
     def identity(self) -> Identity | None:
-        """Which module has answered; None before `open`."""
+        """The module that has answered; None before `open`."""
         return self._unit.identity
 
     async def open(self) -> None:
@@ -134,7 +134,7 @@ class Thermometers:
         await self._probe()
 
     async def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: it holds no line of its own."""
 
     async def read(self) -> tuple[Reading, ...]:
         """Calibrated and raw readings of every sensor; raises DeviceError when the values could not be read.
@@ -192,16 +192,16 @@ class ThermometerModules:
 
     @property
     def identity(self) -> Identity | None:
-        """Which module has answered as the first; None before `open`."""
+        """The module that has answered as the first; None before `open`."""
         return self.modules[0].identity
 
     async def open(self) -> None:
-        """As of each module."""
+        """Open each module."""
         for module in self.modules:
             await module.open()
 
     async def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: it holds no line of its own."""
 
     async def read(self) -> tuple[Reading, ...]:
         """Read all modules; DeviceError when one cannot be read."""

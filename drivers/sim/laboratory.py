@@ -94,7 +94,7 @@ class LaboratorySpec(Document):
 
     @property
     def cameras(self) -> dict[str, CameraSpec]:
-        """By name."""
+        """The specifications of the cameras, by name."""
         return {
             name: CameraSpec.model_validate(each.settings)
             for name, each in self.devices.items()
@@ -159,7 +159,7 @@ class Laboratory:
 
     @property
     def cameras(self) -> dict[str, FakeCamera]:
-        """By name."""
+        """The fake cameras, by name."""
         return {name: each for name, each in self.fakes.items() if isinstance(each, FakeCamera)}
 
     @property

@@ -186,7 +186,7 @@ class ForwardingBackend(IBackend):
         return [Handle(**fields) for fields in listing] if isinstance(listing, list) else []
 
     def get_parent(self, dev: Handle) -> None:
-        """No hubs."""
+        """Return None: the simulated bus has no hubs."""
 
     def get_device_descriptor(self, dev: Handle) -> SimpleNamespace:
         """USB 2.0 table 9-8, and where the device is."""
@@ -216,7 +216,7 @@ class ForwardingBackend(IBackend):
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: Handle, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """There is none."""
+        """Raise IndexError: the simulated interfaces have no endpoint of that number."""
         raise IndexError(ep)
 
     def open_device(self, dev: Handle) -> Handle:
@@ -231,20 +231,20 @@ class ForwardingBackend(IBackend):
             self._drop()
 
     def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
-        """Accepted."""
+        """Accept any configuration: the simulated devices have one."""
 
     def get_configuration(self, dev_handle: Handle) -> int:
         """The only one."""
         return 1
 
     def claim_interface(self, dev_handle: Handle, intf: int) -> None:
-        """Accepted."""
+        """Accept the claim: no other driver contends for it."""
 
     def release_interface(self, dev_handle: Handle, intf: int) -> None:
-        """Accepted."""
+        """Accept the release."""
 
     def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
-        """No kernel driver knows of it."""
+        """Return False: no kernel driver knows of the simulated device."""
         return False
 
     def ctrl_transfer(  # pyusb calls it so, by position

@@ -103,7 +103,7 @@ class GigeDevice:
         self._handler = self._library["g_signal_connect_data"](self._device, b"control-lost", pointer, None, None, 0)
 
     def is_controller(self) -> bool:
-        """Whether we may write."""
+        """Return whether we may write."""
         return not self.is_gige or bool(self._library["arv_gv_device_is_controller"](self._device))
 
     def kind(self, feature: str) -> str:
@@ -113,7 +113,7 @@ class GigeDevice:
         return "" if kind == "Category" else kind
 
     def available(self, feature: str) -> bool:
-        """Whether the camera has the feature and offers it now."""
+        """Return whether the camera has the feature and offers it now."""
         if not self.kind(feature):
             return False
         node = self._library["arv_device_get_feature"](self._device, feature.encode())
@@ -196,7 +196,7 @@ class GigeDevice:
         self._call("arv_camera_start_acquisition")
 
     def stop_acquisition(self) -> None:
-        """No more frames."""
+        """Stop taking frames."""
         self._call("arv_camera_stop_acquisition")
 
     def create_stream(self) -> GigeStream:
@@ -309,7 +309,7 @@ def unpack_pixels(pixel_format: PixelFormat, data: NDArray[np.uint8], shape: tup
 
 
 def _unpack_three_bytes(pixel_format: PixelFormat, data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
-    """Two pixels in three bytes, the middle one shared."""
+    """Unpack two pixels in three bytes, the middle one shared."""
     first, middle, last = _group_bytes(data, 3)
     pairs = np.empty((len(first), 2), np.uint16)
     if pixel_format == "Mono12p":  # the first pixel's low bits come first
@@ -325,7 +325,7 @@ def _unpack_three_bytes(pixel_format: PixelFormat, data: NDArray[np.uint8], coun
 
 
 def _unpack_10_bits(data: NDArray[np.uint8], count: int) -> NDArray[np.uint16]:
-    """Four pixels in five bytes, low bits first."""
+    """Unpack four pixels in five bytes, low bits first."""
     groups = _group_bytes(data, 5)
     pixels = np.empty((len(groups[0]), 4), np.uint16)
     for i in range(4):

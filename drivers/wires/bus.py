@@ -76,7 +76,7 @@ class _Health:
     probe_ns: int = 0
 
     def failed(self, silent: bool, now_ns: int) -> _Health:
-        """After one more."""
+        """Return the health after one more failure."""
         failures = self.failures + 1
         period_s = PROBE_PERIODS_S[min(max(0, failures - DEAD_AFTER_FAILURES), len(PROBE_PERIODS_S) - 1)]
         return _Health(failures, silent, now_ns + to_ns(period_s))
@@ -189,7 +189,7 @@ class Bus:
         return ERRORS[fault.fault](device, f"{where}{fault}")
 
     def _transact(self, function: Callable[..., Result], *args: object) -> Result:
-        """In the worker thread, wait until the line is free and clean, run one transaction, set when it is free
+        """Wait in the worker thread until the line is free and clean, run one transaction, and set when it is free
         again."""
         self._settle()
         hang_ups = self._client.hang_ups

@@ -137,7 +137,7 @@ def _set_heartbeat(name: str, device: GigeDevice, heartbeat_s: float) -> float:
 
 
 def _switch_trigger_off(device: GigeDevice) -> None:
-    """No trigger starts anything; a selector that refuses an entry is left as it is."""
+    """Switch every trigger off; a selector that refuses an entry is left as it is."""
     if not device.available("TriggerMode"):
         return
     for entry in _list_offered(device, "TriggerSelector") or ("",):

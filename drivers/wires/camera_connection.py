@@ -231,7 +231,8 @@ class Connection:
 
     @property
     def clock_began_ns(self) -> int | None:
-        """When the camera's clock read zero, which is when it started, on the stand's clock; None when it has none."""
+        """The instant, on the stand's clock, at which the camera's clock read zero, which is when it started; None when
+        it has none."""
         return self._offset_ns
 
     @property
@@ -328,7 +329,7 @@ class Connection:
         return shot
 
     def next_frame_due_ns(self, time_ns: int) -> int:
-        """When the first free-run frame that begins at or after `time_ns` has been exposed."""
+        """Return when the first free-run frame that begins at or after `time_ns` has been exposed."""
         periods = -((self._phase_ns - time_ns) // self._period_ns)  # rounded up
         begin_ns = self._phase_ns + periods * self._period_ns
         return begin_ns + to_ns(self._exposure_s)
@@ -349,7 +350,7 @@ class Connection:
         return read_temperature(self._device, place)
 
     def temperature_place(self) -> str:
-        """Where the temperature is read, and what else the camera offers, in words; "" when it was not found."""
+        """Return where the temperature is read, and what else the camera offers, in words; "" when it was not found."""
         place = self._temperature
         return "" if isinstance(place, NoTemperature) else describe_place(self._device, place)
 

@@ -16,12 +16,12 @@ NO_CONTROL_HINT = "another client controls the camera, or one that died holds it
 
 
 def lacks_control(error: AravisError) -> bool:
-    """Whether it failed because we do not, or no longer, control the camera."""
+    """Return whether it failed because we do not, or no longer, control the camera."""
     return error.domain == DEVICE_ERRORS and error.code in NO_CONTROL
 
 
 def is_silence(error: AravisError) -> bool:
-    """Whether the camera did not answer, in time or at all, or answered while it was not ready yet."""
+    """Return whether the camera did not answer, in time or at all, or answered while it was not ready yet."""
     return error.domain == DEVICE_ERRORS and error.code in SILENT | NOT_READY
 
 

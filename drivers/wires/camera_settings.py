@@ -95,7 +95,7 @@ class AravisCameraSettings(CameraSettings):
 
     @property
     def period_s(self) -> float:
-        """Time between two frames of a free run."""
+        """The time between two frames of a free run."""
         return 1 / self.frame_rate_hz
 
 

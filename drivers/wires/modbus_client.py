@@ -272,7 +272,7 @@ class TcpClient(ModbusTcpClient):
         return True
 
     def is_closed(self, wait_s: float = 0.0) -> bool:
-        """Whether the peer has closed the connection, or does within that time: what is written into it is never
+        """Return whether the peer has closed the connection, or does within that time: what is written into it is never
         sent."""
         try:
             if self.socket is not None and wait_s > 0:
@@ -305,8 +305,8 @@ class TcpClient(ModbusTcpClient):
 
 
 def _is_reply(packet: bytes, heard: bytes) -> bool:
-    """Whether what was heard is one frame and no more, with the number and the unit of the request. Anything else is
-    left to pymodbus, which takes twice as long to find its way through it."""
+    """Return whether what was heard is one frame and no more, with the number and the unit of the request. Anything
+    else is left to pymodbus, which takes twice as long to find its way through it."""
     is_whole = len(heard) > _HEAD and int.from_bytes(heard[4:6], "big") == len(heard) - 6
     return is_whole and heard[:4] == packet[:4] and heard[6] == packet[6]
 

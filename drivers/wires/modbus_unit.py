@@ -110,7 +110,8 @@ class ModbusUnit:
         )
 
     async def _identity_field(self, stated: IdentityPoint) -> str:
-        """Nothing when the unit does not have the point: it refuses it, or one that was never seen cannot be read."""
+        """Read a part of the identity; "" when the unit does not have the point: it refuses it, or one that was never
+        seen cannot be read."""
         try:
             sample = (await self.snapshot([stated.point])).samples[stated.point]
         except DeviceError as error:
@@ -193,7 +194,7 @@ class ModbusUnit:
 
 
 def is_confirmed(command: RegisterCommand, snapshot: Snapshot) -> bool:
-    """Whether what confirms `command` is so in a snapshot that has read its point."""
+    """Return whether what confirms `command` is so in a snapshot that has read its point."""
     confirm = command.confirm
     if confirm.equals is not None:
         return snapshot.samples[confirm.point].value == confirm.equals

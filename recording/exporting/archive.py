@@ -50,7 +50,7 @@ class DeletionRule:
         )
 
     def applies(self, entry: ListedSession, now_ns: int) -> bool:
-        """Whether the rule applies to this session, by what the list knows of it."""
+        """Return whether the rule applies to this session, by what the list knows of it."""
         age_ns = 0 if entry.end_utc_ns is None else now_ns - entry.end_utc_ns
         is_old = entry.end_utc_ns is not None and age_ns >= self.after_days * 86_400e9
         return bool(is_old and entry.archived and entry.files == Files.SOUND and KEEP_TAG not in entry.tags)
@@ -151,7 +151,7 @@ def _list_files(directory: Path) -> Iterator[str]:
 
 
 def _is_copy(copy: Path, contents: str) -> bool:
-    """Whether a folder is a copy with these contents, by names and sizes."""
+    """Return whether a folder is a copy with these contents, by names and sizes."""
     return copy.is_dir() and _read_manifest(copy).get("contents") == contents == compute_contents_digest(copy)
 
 

@@ -133,7 +133,7 @@ class _ExportProgress:
         self._report = report
 
     def done(self, size_bytes: int, text: str) -> None:
-        """So much more has been read."""
+        """Note that so much more has been read."""
         self._done_bytes += size_bytes
         self._report(min(1.0, self._done_bytes / self._total_bytes), text)
 

@@ -48,7 +48,7 @@ class ReplayClock:
 
     @property
     def lead_ns(self) -> int:
-        """That of the wall clock, in the session's time."""
+        """The lead of the wall clock, in the session's time."""
         return round(self._wall.lead_ns * self._speed)
 
     def now_ns(self) -> int:

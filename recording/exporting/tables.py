@@ -72,7 +72,8 @@ def escape_cell(text: str) -> str:
 
 
 def _is_control(char: str) -> bool:
-    """Whether it is not shown, or changes how what follows is shown: such as ESC, or one that turns the direction."""
+    """Return whether it is not shown, or changes how what follows is shown: such as ESC, or one that turns the
+    direction."""
     return unicodedata.category(char) in ("Cc", "Cf", "Cs")
 
 

@@ -57,12 +57,12 @@ class BatchSchema:
 
     @property
     def topic(self) -> str:
-        """Where they are recorded."""
+        """The topic on which these batches are recorded."""
         return READINGS + self.name
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Of its topic: what `parse_batch_schema` makes the form of again."""
+        """The metadata of the topic, from which `parse_batch_schema` makes the schema again."""
         channels = [[each.name, each.unit, each.kind] for each in self.device.channels]
         text = json.dumps(channels, ensure_ascii=False, separators=(",", ":"))
         opened = {} if self.device.is_opened else {_OPENED: _BY_USE}

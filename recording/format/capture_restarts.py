@@ -26,17 +26,18 @@ def find_restarted_step(event: Event) -> str:
 
 
 def count_frames_lost(event: Event) -> int:
-    """So many frames of the capture were lost by the disk; 0 when it was restarted for another reason."""
+    """Return how many frames of the capture were lost by the disk; 0 when it was restarted for another reason."""
     count = event.data.get("frames_lost")
     return count if isinstance(count, int) else 0
 
 
 def find_restart_times(events: Iterable[Event]) -> dict[str, int]:
-    """Of each capture that was begun again, by step id, the instant (ns) before which its frames do not count."""
+    """Return, for each capture that was begun again, by step id, the instant (ns) before which its frames do not
+    count."""
     found = ((find_restarted_step(event), event.time_ns) for event in events)
     return {step_id: time_ns for step_id, time_ns in found if step_id}
 
 
 def is_superseded(time_ns: int, step_id: str, begins_ns: Mapping[str, int]) -> bool:
-    """Whether a frame of that instant and step does not count, by what `find_restart_times` its session says."""
+    """Return whether a frame of that instant and step does not count, by what `find_restart_times` its session says."""
     return time_ns < begins_ns.get(step_id, time_ns)

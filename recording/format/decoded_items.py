@@ -30,7 +30,7 @@ class RecordedImage:
 
     @property
     def time_ns(self) -> int:
-        """Middle of the exposure."""
+        """The middle of the exposure."""
         return self.meta.time_ns
 
 
@@ -51,7 +51,8 @@ def decode_event_item(message: RecordedMessage) -> Event:
 
 
 def is_item_channel(channel: Channel) -> bool:
-    """Whether each message of a channel is an item; not so the log and the table's pose, which the recorder derives."""
+    """Return whether each message of a channel is an item; not so the log and the table's pose, which the recorder
+    derives."""
     return channel.topic.startswith(READINGS) or channel.topic in (messages.STEP, messages.EVENT, messages.ORIGINAL)
 
 

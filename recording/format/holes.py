@@ -33,7 +33,7 @@ class Hole:
     excused: bool = False
 
     def covers(self, time_ns: int) -> bool:
-        """Whether something of that instant would have been in it."""
+        """Return whether something of that instant would have been in it."""
         return (self.begin_ns is None or self.begin_ns < time_ns) and (self.end_ns is None or time_ns < self.end_ns)
 
     def clip(self, begin_ns: int, end_ns: int) -> Hole | None:
@@ -53,7 +53,7 @@ class Hole:
         return f"{begin}to {utc.local_text(self.end_ns)}"
 
     def text(self, utc: UtcOffsets) -> str:
-        """Which segments, when, and how many frames, as a part of a sentence."""
+        """The hole as a part of a sentence: which segments, when, and how many frames."""
         frames = "" if not self.frames else f"{self.frames} frame{'' if self.frames == 1 else 's'} {_WHAT[self.series]}"
         if self.first is None:
             return ", ".join(part for part in (frames, self.format_time(utc)) if part)
@@ -70,7 +70,7 @@ def format_segments(series: str, first: int, last: int | None) -> str:
 
 
 def format_holes(holes: Iterable[Hole]) -> str:
-    """For the session record of a copy; "" when there is none."""
+    """Write the holes for the session record of a copy; "" when it has none."""
     entries = [asdict(hole) for hole in holes]
     return json.dumps(entries, separators=(",", ":")) if entries else ""
 

@@ -51,7 +51,7 @@ _DATA_TAG = bytes([RawImage.DATA_FIELD_NUMBER << 3 | _LENGTH_DELIMITED])
 
 
 class FrameTopics(NamedTuple):
-    """Of one camera: `/camera/meta` and `/camera/image`."""
+    """The topics of one camera: `/camera/meta` and `/camera/image`."""
 
     meta: str
     image: str
@@ -274,5 +274,5 @@ def _partial(frame: Frame, windows: Windows, fill_DN: int) -> Frame:
 
 
 def select_frame_readings(readings: Iterable[Reading]) -> tuple[Reading, ...]:
-    """Those that describe a frame: temperatures and positions."""
+    """Select the readings that describe a frame: temperatures and positions."""
     return tuple(reading for reading in readings if reading.unit in ("degC", "mm", "deg"))

@@ -145,14 +145,15 @@ def is_locked(path: Path) -> bool:
 
 
 def is_misplaced(series: str, number: int, place: Mapping[str, str], session: Mapping[str, str]) -> bool:
-    """Whether the record `segment` gives another place in the session than the file's name: it was doubled, swapped or
-    renamed."""
+    """Return whether the record `segment` gives another place in the session than the file's name: it was doubled,
+    swapped or renamed."""
     due = make_segment_metadata(series, number, session)
     return bool(place.keys() - due.keys()) or any(place.get(key) != due[key] for key in due.keys() - {SESSION_CRC})
 
 
 def find_foreign_numbers(numbers: Iterable[int]) -> set[int]:
-    """Those that no segment of the session can have: behind more missing ones than any session has segments."""
+    """Find the numbers that no segment of the session can have: behind more missing ones than any session has
+    segments."""
     known = sorted(set(numbers))
     for place, (before, after) in enumerate(pairwise([-1, *known])):
         if after - before > MOST_MISSING:

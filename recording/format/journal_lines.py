@@ -36,7 +36,7 @@ class CheckedLines:
 
 
 def make_mark(name: str) -> bytes:
-    """Of a new file in the session of that name; copies and renamed sessions keep what they have."""
+    """Make the mark of a new file in the session of that name; copies and renamed sessions keep what they have."""
     return b"%08x" % zlib.crc32(name.encode(errors="surrogateescape"))
 
 
@@ -69,12 +69,12 @@ def parse_lines(data: bytes) -> CheckedLines:
 
 
 def _format_crc(marked: bytes, place: int) -> bytes:
-    """With the space behind it."""
+    """Write the CRC of a line, with the space behind it."""
     return b"%08x " % zlib.crc32(marked, place)
 
 
 def format_damage(lines: CheckedLines) -> str:
-    """Which lines are damaged, as the part of a sentence."""
+    """Write which lines are damaged, as the part of a sentence."""
     first = f"line {lines.damaged[0]}"
     more = f" and {len(lines.damaged) - 1} more" if len(lines.damaged) > 1 else ""
     return f"{first}{more} of {lines.of} {'are' if more else 'is'} damaged; the lines after it count"
@@ -106,12 +106,12 @@ class JournalFacts:
 
 
 def hash_text(text: str | None) -> str:
-    """Of an attached text; "" for none."""
+    """Return the hash of an attached text; "" for none."""
     return "" if text is None else hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def read_journal_facts(directory: Path) -> JournalFacts | None:
-    """Of the journal in a session's folder, which is not changed; None when there is none."""
+    """Read the facts of the journal in a session's folder, which is not changed; None when it has none."""
     path = directory / JOURNAL_NAME
     try:
         if not path.is_file():
@@ -144,7 +144,7 @@ def read_journal_facts(directory: Path) -> JournalFacts | None:
 
 
 def _read_texts(first: Mapping[str, object] | None) -> dict[str, str] | None:
-    """Those of a journal's first entry."""
+    """Return the texts of a journal's first entry."""
     found = None if first is None or first.get("entry") != "Begun" else first.get("texts")
     if not isinstance(found, dict):
         return None

@@ -43,7 +43,7 @@ def make_segment_metadata(series: str, number: int, session: Mapping[str, str]) 
 
 
 def is_contradicting(segment: Mapping[str, str], session: Mapping[str, str]) -> bool:
-    """Whether the two records of one segment do not belong together: one of them is damaged."""
+    """Return whether the two records of one segment do not belong together: one of them is damaged."""
     return segment.get(SESSION_CRC, _format_crc(session)) != _format_crc(session)
 
 

@@ -86,7 +86,7 @@ class JournalDigest:
 
 
 def digest_journal(data: bytes) -> JournalDigest:
-    """Of all whole lines in `data`."""
+    """Compute the digest of all whole lines in `data`."""
     whole = data[: data.rfind(b"\n") + 1]
     return JournalDigest(whole.count(b"\n"), len(whole), hashlib.sha256(whole).hexdigest())
 
@@ -114,7 +114,7 @@ class Manifest:
         return json.dumps({**fields, "sha256": _compute_sha256(fields)}, indent=1, sort_keys=True).encode() + b"\n"
 
     def add_segment(self, name: str, sealed: Sealed) -> Manifest:
-        """With that one more, or as it is now."""
+        """Return the manifest with that segment more, or with it as it is now."""
         return replace(self, segments={**self.segments, name: sealed})
 
 

@@ -336,7 +336,7 @@ def decode_original(data: bytes, time_ns: int) -> Original:
 
 
 def encode_table_pose(time_ns: int, linear_mm: float, rotary_deg: float) -> bytes:
-    """Where the table is, as foxglove.PoseInFrame in `stand`: x along the linear axis in m, rotation about z."""
+    """Encode where the table is, as foxglove.PoseInFrame in `stand`: x along the linear axis in m, rotation about z."""
     pose = _make_table_pose(linear_mm, rotary_deg)
     return PoseInFrame(timestamp=make_timestamp(time_ns), frame_id="stand", pose=pose).SerializeToString()
 

@@ -116,7 +116,7 @@ class FramePlace:
 
     @property
     def time_ns(self) -> int:
-        """Middle of the frame's exposure."""
+        """The middle of the frame's exposure."""
         return self.meta.time_ns
 
     @property
@@ -216,7 +216,7 @@ def _read_head(path: Path, file: BinaryIO, summary: Summary) -> Head:
 
 @lru_cache(16)  # each segment of a session has the session's
 def _parse_metadata(content: bytes) -> tuple[str, Mapping[str, str]]:
-    """Its name, and what it says."""
+    """Return the name of a metadata record, and what it says."""
     metadata = Metadata.read(make_stream(content))
     return metadata.name, metadata.metadata
 
@@ -291,7 +291,7 @@ def _read_chunk(file: BinaryIO, place: ChunkPlace) -> memoryview:
 
 
 def _read_exactly(file: BinaryIO, offset: int, length: int) -> bytes:
-    """So many bytes from there; ValueError when there are fewer, before memory is taken for them."""
+    """Read so many bytes from that place; ValueError when the file has fewer, before memory is taken for them."""
     if length > CHUNK_LIMIT_BYTES or offset + length > os.fstat(file.fileno()).st_size:
         raise ValueError(f"{length} bytes at {offset} are not in the file")
     file.seek(offset)

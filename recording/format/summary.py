@@ -101,7 +101,7 @@ class Summary:
 # Segments of one session, and mostly of all, have the same schemas and channels: a list of sessions decodes them once.
 @lru_cache(256)
 def _parse_schema(record: bytes) -> tuple[int, str]:
-    """Its number and its name."""
+    """Return the number and the name of a schema record."""
     schema = Schema.read(make_stream(record))
     return schema.id, schema.name
 
@@ -128,7 +128,8 @@ def _parse_map(record: memoryview, begin: int, size_bytes: int) -> dict[int, int
 
 
 def _read_summary_bytes(file: BinaryIO, size_bytes: int) -> tuple[int, memoryview]:
-    """Where the summary begins, and its records, their CRC checked, which covers the footer before the CRC, too."""
+    """Return where the summary begins, and its records, their CRC checked, which covers the footer before the CRC,
+    too."""
     tail_begin = max(0, size_bytes - _TAIL_BYTES)
     file.seek(tail_begin)
     tail = file.read(size_bytes - tail_begin)

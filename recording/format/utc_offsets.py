@@ -42,7 +42,7 @@ class UtcOffsets:
         return self.offsets_ns[index - 1] if index else self.first_ns
 
     def utc_ns(self, stand_ns: int) -> int:
-        """That instant as UTC."""
+        """Return that instant as UTC."""
         return min(max(stand_ns + self.at(stand_ns), _INT64[0]), _INT64[1])
 
     def stand_ns(self, utc_ns: int) -> int:
@@ -76,12 +76,12 @@ def collect_offsets(events: Iterable[Event]) -> UtcOffsets:
 
 
 def make_offset_event(time_ns: int, offset_ns: int) -> Event:
-    """That the offset is this one still, for a segment or a part that begins with it."""
+    """Make the event that the offset is this one still, for a segment or a part that begins with it."""
     return make_step_event(time_ns, offset_ns, offset_ns, time_ns)
 
 
 def make_step_event(time_ns: int, before_ns: int, after_ns: int, seen_ns: int) -> Event:
-    """That the offset is `after_ns` now, and was before_ns until seen_ns."""
+    """Make the event that the offset is `after_ns` now, and was before_ns until seen_ns."""
     return CLOCK_STEP.at(
         time_ns,
         offset_before_ns=before_ns,
@@ -93,7 +93,7 @@ def make_step_event(time_ns: int, before_ns: int, after_ns: int, seen_ns: int) -
 
 
 def _parse_step(event: Event) -> tuple[int, int, int] | None:
-    """From when on, the offset before and after, ns."""
+    """Return from when on, and the offset before and after, ns."""
     before, after = event.data.get("offset_before_ns"), event.data.get("offset_after_ns")
     if isinstance(before, int) and isinstance(after, int):
         return event.time_ns, before, after

@@ -279,7 +279,7 @@ class _Index:
         return opened
 
     def _is_ours(self) -> bool:
-        """Whether it is a file, and no link to another place."""
+        """Return whether it is a file, and no link to another place."""
         return self._path.is_file() and not self._path.is_symlink()
 
     def _read(self) -> dict[bytes, tuple[str, str]]:

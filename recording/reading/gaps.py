@@ -32,7 +32,8 @@ _RHYTHM = 3  # readings; with fewer there is no spacing to compare with
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """No reading between two instants, ns; `names` are devices, or single channels of a device, or "everything"."""
+    """A span without readings between two instants, ns; `names` are devices, or single channels of a device, or
+    "everything"."""
 
     names: tuple[str, ...]
     begin_ns: int
@@ -95,7 +96,7 @@ def _find_holes(recorded: Mapping[str, NDArray[np.int64]], begin_ns: int, end_ns
 
 
 def _is_same_gap(one: _Hole, other: _Hole) -> bool:
-    """Two devices stopped and came back together, within their spacing."""
+    """Return whether two devices stopped and came back together, within their spacing."""
     tolerance_ns = max(one.limit_ns, other.limit_ns)
     return (
         one.device != other.device
@@ -137,7 +138,7 @@ def list_reported_blocks(events: Iterable[Event]) -> list[range]:
 
 
 def _parse_pair(found: object) -> tuple[int, int]:
-    """Two whole numbers; (0, -1) when it is something else."""
+    """Return two whole numbers; (0, -1) when it is something else."""
     match found:
         case [int(first), int(last)]:
             return first, last

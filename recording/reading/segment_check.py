@@ -228,7 +228,7 @@ class _SegmentChecker:
             self._compare()
 
     def _list_places(self) -> list[int]:
-        """Where each indexed record begins, in order, and where the last one ends."""
+        """Return where each indexed record begins, in order, and where the last one ends."""
         index = self._index
         ends = {place: place + entry.chunk_length + entry.message_index_length for place, entry in index.chunks.items()}
         ends.update(

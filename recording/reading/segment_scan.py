@@ -113,7 +113,7 @@ def check_record(opcode: int, content: bytes) -> ChunkContents | Metadata | Atta
 
 
 def _is_text(record: Header | Metadata | DataEnd) -> bool:
-    """No text has a NUL; a lost block of the disk reads as zeros."""
+    """Return whether bytes can be a text: no text has a NUL, and a lost block of the disk reads as zeros."""
     if isinstance(record, Metadata):
         texts = [record.name, *record.metadata.keys(), *record.metadata.values()]
         return not any("\0" in text for text in texts)
@@ -152,7 +152,7 @@ _ONE = 1 << 31
 
 
 class RangeCrcs:
-    """Of the stretches of `source` behind `begin`. Raises OSError when the disk does not give a byte."""
+    """The CRCs of the stretches of `source` behind `begin`. Raises OSError when the disk does not give a byte."""
 
     def __init__(self, source: Source, begin: int) -> None:
         self._source = source
@@ -233,11 +233,12 @@ class ScanBudget:
         self._crcs: RangeCrcs | None = None
 
     def charge(self, size_bytes: int) -> None:
-        """So many bytes were read, or inflated, for a claim that was false."""
+        """Charge the budget with bytes that were read, or inflated, for a claim that was false."""
         self._false_bytes += size_bytes
 
     def allows(self, offset: int, claim: RecordHead, chunk: ChunkHead | None) -> bool:
-        """Whether the record at `offset` may be read within the scan budget; `chunk` is its head when it is one."""
+        """Return whether the record at `offset` may be read within the scan budget; `chunk` is its head when it is
+        one."""
         if self._false_bytes <= self._source.size + _FREE_BYTES:
             return True
         if self._false_bytes > _LIMIT_FACTOR * self._source.size + _LIMIT_BYTES:
@@ -261,7 +262,7 @@ class ScanBudget:
 
 
 def _is_compressed_start(data: bytes) -> bool:
-    """Whether that can be the begin of a compressed chunk."""
+    """Return whether that can be the begin of a compressed chunk."""
     try:
         zstandard.ZstdDecompressor().decompressobj().decompress(data)
     except zstandard.ZstdError:
@@ -296,7 +297,7 @@ class PlacedChunk(NamedTuple):
 
 
 def find_misplaced_chunks(chunks: Sequence[PlacedChunk], damages: Sequence[Span]) -> list[Span]:
-    """Where such sectors are: from the begin of the damage before to the end of the one behind."""
+    """Find where such sectors are: from the begin of the damage before to the end of the one behind."""
     near = [pair for pair in pairwise(damages) if pair[1].begin - pair[0].end <= SECTOR_BYTES]
     if not near:
         return []
@@ -355,13 +356,14 @@ class BlockLengths:
         self._largest_index_bytes = max(self._largest_index_bytes, index_bytes)
 
     def is_partial_write(self, source: Source, begin: int) -> bool:
-        """Whether the bytes from `begin` to the end of the file, which prove nothing, were never acknowledged."""
+        """Return whether the bytes from `begin` to the end of the file, which prove nothing, were never
+        acknowledged."""
         written_end = _find_last_written(source, begin)
         head = source.read(begin, RECORD.size)
         return _is_begun(head, begin, written_end) and source.size <= self._find_latest_end(head, begin, written_end)
 
     def _find_latest_end(self, head: bytes, begin: int, written_end: int) -> int:
-        """Where the block with the damage at `begin` ends at the latest."""
+        """Return where the block with the damage at `begin` ends at the latest."""
         if begin < self._end:  # in the message indexes of the last one
             return self._end
         claim = parse_record_head(head)
@@ -378,7 +380,7 @@ class BlockLengths:
 
 
 def _is_begun(head: bytes, begin: int, written_end: int) -> bool:
-    """Whether a record begins there and is cut where the zeros begin."""
+    """Return whether a record begins there and is cut where the zeros begin."""
     written = head[: written_end - begin]
     if begin == 0:
         return MCAP0_MAGIC.startswith(written)
@@ -395,7 +397,7 @@ def _compute_index_bytes(messages: Counter[int]) -> int:
 
 
 def _find_last_written(source: Source, begin: int) -> int:
-    """Where the zeros begin that fill the end of the file."""
+    """Return where the zeros begin that fill the end of the file."""
     end = source.size
     while end > begin:
         window = max(begin, end - WINDOW_BYTES)
@@ -456,7 +458,7 @@ class SegmentScan:
 
 
 def _no_report(read_bytes: int) -> None:
-    """No progress is shown."""
+    """Show no progress."""
 
 
 def scan_segment(
@@ -589,7 +591,7 @@ class _SegmentScanner:
             self.found.damages.append(gap)
 
     def _is_table(self, begin: int) -> bool:
-        """Whether the table of frames begins there, behind the last of them, which is made again."""
+        """Return whether the table of frames begins there, behind the last of them, which is made again."""
         head = self._source.read(begin, len(_TABLE_HEAD) + RECORD.size)
         return head[:1] == _TABLE_HEAD[:1] and head[RECORD.size + 16 :].startswith(_TABLE_HEAD[1:])
 

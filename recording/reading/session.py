@@ -160,7 +160,7 @@ class Session:
         return found
 
     def believed(self, channel: str) -> ChannelColumn:
-        """As `readings`, without those that were recorded as suspect (cause "suspect")."""
+        """Return readings as `readings` does, without those that were recorded as suspect (cause "suspect")."""
         times_ns, values = self.readings(channel)
         kept = ~np.isin(times_ns, self._uncertain.get(channel, []))
         return ChannelColumn(times_ns[kept], values[kept])
@@ -215,7 +215,7 @@ class Session:
 
     @property
     def frame_times_ns(self) -> NDArray[np.int64]:
-        """Middle of the exposure of each frame, shape (frame_count,), ascending."""
+        """The middle of the exposure of each frame, shape (frame_count,), ascending."""
         return np.array([place.time_ns for place in self._iterate_places()], np.int64)
 
     def frames_table(self) -> FramesTable:
@@ -256,8 +256,8 @@ class Session:
         return (item for _, item in self.published())
 
     def published(self) -> Iterator[tuple[int, Item]]:
-        """As `items`, with the instants of their publication. A frame comes behind what was published at its instant,
-        but before the end of its step."""
+        """Iterate as `items` does, with the instants of their publication. A frame comes behind what was published at
+        its instant, but before the end of its step."""
         frames = iter(sorted(self._iterate_places(), key=attrgetter("meta.published_ns")))
         place = next(frames, None)
         for item in self._decode(is_item_channel, decode_item):

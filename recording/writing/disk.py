@@ -60,5 +60,5 @@ class DiskCalls:
             raise SessionError(str(error.strerror or error)) from error
 
     def close(self) -> None:
-        """As a lane."""
+        """Close the worker, as a lane is closed."""
         self._lane.close()

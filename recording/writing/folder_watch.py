@@ -42,7 +42,7 @@ class WatchedFolder:
             raise FolderLost(errno.ENOENT, f"the folder {self._folder} {self._describe_loss()}")
 
     def recover(self) -> bool:
-        """After a FolderLost: whether the folder is back; else one is made at its place."""
+        """Return, after a FolderLost, whether the folder is back; else one is made at its place."""
         with suppress(FolderLost):
             self.check()
             return True
@@ -95,7 +95,7 @@ class CompanionFile(Protocol):
         ...
 
     async def recover(self) -> bool:
-        """Whether it is back; else it has been rewritten. OSError when that cannot be done."""
+        """Return whether it is back; else it has been rewritten. OSError when that cannot be done."""
         ...
 
 

@@ -75,7 +75,7 @@ class StandSnapshot:
             self._steps = {item.step_id: item}
 
     def of(self, frame: Frame, now_ns: int) -> FrameContext:
-        """Of a frame that is published now."""
+        """Describe a frame that is published now."""
         mark = self._steps.get(frame.step_id)
         parameters = {} if mark is None else mark.parameters
         degC = parameters.get("chamber_degC")
@@ -120,17 +120,17 @@ class FrameRecorder:
 
     @property
     def saved(self) -> int:
-        """On the disk."""
+        """The number of frames that are on the disk."""
         return self._writer.saved
 
     @property
     def done(self) -> int:
-        """Of those taken: on the disk, or lost."""
+        """The number of frames taken that are on the disk, or lost."""
         return self._writer.done
 
     @property
     def waiting(self) -> int:
-        """In the queue."""
+        """The number of frames in the queue."""
         return self._queue.qsize()
 
     def receive(self, item: Item) -> None:
@@ -177,8 +177,8 @@ class FrameRecorder:
         self._homes.follow(FRAMES, failure, self.kept)
 
     async def finish(self) -> None:
-        """Those that wait; the first may be one that found its folder gone when the recording was ended. None is taken
-        from then on."""
+        """Save the frames that wait; the first may be one that found its folder gone when the recording was ended. None
+        is taken from then on."""
         frame = await self.lane.call(lambda: self._writer.homeless)
         while frame is not None or not self._queue.empty():
             frame = frame or self._queue.get_nowait()
@@ -256,7 +256,7 @@ class FrameWriter:
         return FrameOutcome.SAVED, ""
 
     def tend(self, now_ns: int, refused: bool) -> OSError | None:
-        """Without a frame: close the segment when it is old, and say whether frames could be written; `refused`: the
+        """Close the segment when it is old, without a frame, and return whether frames could be written; `refused`: the
         last one could not, and so a block as large is tried."""
         try:
             self._series.check()

@@ -55,12 +55,13 @@ def _find_in_list(locks: str, device: int, inode: int) -> int:
 
 
 def _may_end(pid: int) -> bool:
-    """Whether the holder is no daemon and none's: a disk process that was left behind, or one that is just ending."""
+    """Return whether the holder is no daemon and none's: a disk process that was left behind, or one that is just
+    ending."""
     return _is_orphan(pid) or not _read_command(pid)
 
 
 def _is_orphan(pid: int) -> bool:
-    """Whether this is a disk process whose daemon has gone."""
+    """Return whether this is a disk process whose daemon has gone."""
     command = _read_command(pid)
     if MODULE.encode() not in command:
         return False

@@ -61,7 +61,7 @@ class ManifestFile:
         self._write()
 
     def end(self) -> None:
-        """Nothing is recorded any more. With a segment that could not be finished it is no end."""
+        """Record nothing any more. With a segment that could not be finished it is no end."""
         with suppress(OSError):
             if any(self._directory.glob(f"*/*{UNFINISHED}")):
                 return
@@ -125,8 +125,8 @@ def _list_finished(directory: Path) -> list[SegmentFile]:
 
 
 def _add_segments(directory: Path, manifest: Manifest) -> Manifest:
-    """With the finished segments of the session that are not listed yet: those of the last moments before a kill, and
-    those that a repair has made. One that cannot be read, or is another session's, is left out."""
+    """Return the manifest with the finished segments of the session that are not listed yet: those of the last moments
+    before a kill, and those that a repair has made. One that cannot be read, or is another session's, is left out."""
     for file in _list_finished(directory):
         with suppress(SessionError):
             head = read_head(file.path)

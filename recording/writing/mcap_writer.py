@@ -88,7 +88,7 @@ class McapWriter:
         return parts
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """In front of the chunk in progress."""
+        """Write an attachment in front of the chunk in progress."""
         begin, length = self._write(encode_record(attachment))
         self._attachment_indexes.append(
             AttachmentIndex(
@@ -103,18 +103,18 @@ class McapWriter:
         )
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """In front of the chunk in progress."""
+        """Write metadata in front of the chunk in progress."""
         begin, length = self._write(encode_record(Metadata(name=name, metadata=dict(entries))))
         self._metadata_indexes.append(MetadataIndex(offset=begin, length=length, name=name))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Its number."""
+        """Add a schema and return its number."""
         self._schemas.append(Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data))
         self._add(encode_record(self._schemas[-1]))
         return len(self._schemas)
 
     def add_channel(self, topic: str, encoding: str, schema: int, entries: Mapping[str, str]) -> int:
-        """Its number."""
+        """Add a channel and return its number."""
         number = len(self._channels) + 1
         self._channels.append(
             Channel(id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata=dict(entries))
@@ -224,7 +224,7 @@ class McapWriter:
             self.end_chunk()
 
     def _write(self, *parts: bytes | memoryview) -> tuple[int, int]:
-        """Where they begin, and their length."""
+        """Write bytes, and return where they begin and their length."""
         begin = self._written_bytes
         self._parts += parts
         self._written_bytes += sum(map(len, parts))

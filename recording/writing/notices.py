@@ -24,7 +24,7 @@ from thermostand.foundation.readings import Frame
 
 
 class Space(NamedTuple):
-    """Of the file system of a folder: what an ordinary user may still write, and all of it."""
+    """The space of a folder's file system: what an ordinary user may still write, and all of it."""
 
     free_bytes: int
     total_bytes: int
@@ -102,7 +102,7 @@ class FrameLosses:
         return sum(time_ns >= self._begins_ns.get(step_id, time_ns) for step_id, time_ns in tuple(self._lost_ns))
 
     def of(self, step_id: str) -> int:
-        """Those of this step."""
+        """Return how many frames of this step were lost."""
         begin_ns = self._begins_ns.get(step_id, 0)
         return sum(lost == step_id and time_ns >= begin_ns for lost, time_ns in tuple(self._lost_ns))
 

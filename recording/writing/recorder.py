@@ -104,8 +104,9 @@ class Recorder:
 
     @property
     def waiting_since_ns(self) -> int | None:
-        """When the oldest reading, event or frame was published that is not yet durable in this session's own folder;
-        None when nothing is due. A frame that the disk refused waits until frames can be written again."""
+        """The instant at which the oldest reading, event or frame was published that is not yet durable in this
+        session's own folder; None when nothing is due. A frame that the disk refused waits until frames can be written
+        again."""
         return self._waiting.since_ns
 
     @property
@@ -120,11 +121,11 @@ class Recorder:
 
     @property
     def disk_free_bytes(self) -> int:
-        """As it was found at the last commit; does not wait for the disk."""
+        """The free bytes that the last commit found; asking does not wait for the disk."""
         return self._frames.series.space.last.free_bytes
 
     def watch_file(self, file: CompanionFile) -> None:
-        """From now on this file counts as part of the session's folder: `folder_lost` and `refound` know of it."""
+        """Count this file as part of the session's folder from now on: `folder_lost` and `refound` know of it."""
         self._homes.companions.append(file)
 
     def recover_folder(self) -> None:
@@ -138,7 +139,7 @@ class Recorder:
         self._take(self._open_series(), earlier)
 
     async def begin(self, earlier: Callable[[], Iterable[Item]]) -> None:
-        """As `start`, off the loop."""
+        """Begin recording off the event loop, as `start` does."""
         lane = WorkerThread("record-begin", self._clock, patient=False)
         try:
             series = await lane.call(self._open_series)
@@ -249,7 +250,7 @@ class Recorder:
         self._notices.append(kind.at(0, text))
 
     async def _on_ticks(self, work: Callable[[int], Awaitable[None]]) -> None:
-        """At each instant at which the telemetry is committed."""
+        """Do this work at each instant at which the telemetry is committed."""
         due_ns = self._clock.now_ns()
         while True:
             due_ns += to_ns(self._settings.telemetry_commit_s)
@@ -265,7 +266,7 @@ class Recorder:
         self._report()
 
     async def _recover_when_requested(self) -> None:
-        """After `refound`: the folders are found or made again, and the loss is an event."""
+        """Find the folders or make them again after `refound`, and make the loss an event."""
         while True:
             await self._homes.recovery_requested.wait()
             made_again = await self._homes.recover(

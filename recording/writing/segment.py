@@ -282,7 +282,7 @@ class Segment:
 
     @property
     def name(self) -> str:
-        """Within the session, as it is called when it is finished."""
+        """The name within the session, as it is called when it is finished."""
         return f"{self._form.name}/{self._finished.name}"
 
     def finish(self) -> Sealed:

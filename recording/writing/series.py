@@ -121,8 +121,8 @@ class Series:
             path.unlink(missing_ok=True)
 
     def recover(self) -> bool:
-        """After a FolderLost: whether the folder is back, and writing continues where it was; else one is made at its
-        place, and the numbers continue. OSError when that cannot be done."""
+        """Return, after a FolderLost, whether the folder is back, and writing continues where it was; else one is made
+        at its place, and the numbers continue. OSError when that cannot be done."""
         if self._home.recover():
             return True
         segment, self._segment = self._segment, None
@@ -165,7 +165,7 @@ class Series:
 
 
 def _ignore_sealed(name: str, sealed: Sealed) -> None:
-    """Of a series without a session around it."""
+    """Do nothing: the series has no session around it."""
 
 
 def find_next_number(folder: Path) -> int:
@@ -195,7 +195,7 @@ class SpaceFound(NamedTuple):
 
 
 class SessionSeries:
-    """Both series of a session, made or continued in `directory`, and the watch over their disk; the telemetry is
+    """The two series of a session, made or continued in `directory`, and the watch over their disk; the telemetry is
     begun. Blocking; raises OSError. Each series is used from one thread, the watch from both."""
 
     def __init__(self, directory: Path, form: SessionSpec, time_ns: int) -> None:
@@ -253,7 +253,7 @@ class DiskSpace:
         self._tell = tell
 
     def found(self, space: SpaceFound) -> None:
-        """As of now."""
+        """Keep the free space as of now, and pass its notices on."""
         self.last = space
         for notice in space.notices:
             self._tell(notice)
@@ -275,7 +275,7 @@ class DiskSeries:
         self.space.found(self._ask("check_space"))
 
     def check(self) -> None:
-        """As in Series, like all below."""
+        """Check the disk as Series.check does; all methods below are those of Series, too."""
         self._do("check")
 
     def commit(self, records: Sequence[MessageRecord], time_ns: int) -> None:
@@ -287,7 +287,7 @@ class DiskSeries:
         self._do("probe", size_bytes, time_ns)
 
     def recover(self) -> bool:
-        """Whether the folder is back."""
+        """Return whether the folder is back."""
         return bool(self._do("recover"))
 
     def finish_full(self, time_ns: int) -> None:

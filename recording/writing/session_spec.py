@@ -38,7 +38,7 @@ class SessionSpec:
         return Manifest(dict(self.metadata), devices, texts)
 
     def frames(self) -> SeriesSpec:
-        """Of the frames: raw ones are chosen for speed."""
+        """The specification of the frames' series: raw ones are chosen for speed."""
         settings = self.settings
         return SeriesSpec(
             name=FRAMES,
@@ -55,7 +55,7 @@ class SessionSpec:
         )
 
     def make_telemetry_spec(self) -> SeriesSpec:
-        """Of the telemetry: many small commits, merged when a segment is full."""
+        """Make the specification of the telemetry's series: many small commits, merged when a segment is full."""
         return SeriesSpec(
             name=TELEMETRY,
             topics=list_telemetry_topics(self.devices),

@@ -66,12 +66,12 @@ class TelemetryRecorder:
 
     @property
     def items_saved(self) -> int:
-        """Of the items taken."""
+        """The number of items taken that are on the disk."""
         return self._writer.items_saved
 
     @property
     def messages_saved(self) -> int:
-        """On the disk."""
+        """The number of messages that are on the disk."""
         return self._writer.messages_saved
 
     @property
@@ -109,7 +109,7 @@ class TelemetryRecorder:
         return failure
 
     async def finish(self) -> None:
-        """Nothing published from now on is taken; the rest is saved and the segment completed. SessionError when one of
+        """Take nothing that is published from now on, save the rest and complete the segment. SessionError when one of
         them fails."""
         self.taking = False
         failure = await self.save()

@@ -116,7 +116,7 @@ class Assembly:
 
 
 def _watch_heat_output(regulator: Controller) -> tuple[Watch, ...]:
-    """Of a regulator of our own: that what it heats by obeys its command."""
+    """Watch that what a regulator of our own heats by obeys its command."""
     if not isinstance(regulator, SoftwareRegulator):
         return ()
     return (Watch(forbid_uncontrolled_heat(lambda: regulator.heat_uncontrolled), action="hold"),)

@@ -140,7 +140,8 @@ class Chamber:
 
     @property
     def ordered(self) -> ChamberOrder | None:
-        """None while nothing is permitted: the set-point that the regulator remembers is then nobody's wish."""
+        """The order that is in effect; None while nothing is permitted: the set-point that the regulator remembers is
+        then nobody's wish."""
         return self._order if self.permits.is_granted else None
 
     async def start(self, setpoint_degC: float) -> None:
@@ -239,6 +240,6 @@ class Chamber:
             await self._regulator.test_dead_man()
 
     def _report_missing_dead_man(self) -> None:
-        """No board drops the heat when this daemon dies: what ends it then is recorded with the session."""
+        """Record with the session that no board drops the heat when this daemon dies, and what ends it then."""
         what = self._regulator.dead_man if isinstance(self._regulator, ClimateChamber) else "nothing"
         self._hub.publish(NO_DEAD_MAN.at(self._clock.now_ns(), device=self._regulator.name, ends_it=what))

@@ -82,7 +82,7 @@ class _StoredState(BaseModel):
     boot_id: str | None = None
 
     def is_usable_in(self, boot: Boot | None) -> bool:
-        """Whether its times can be understood now."""
+        """Return whether its times can be understood now."""
         return self.boot_id is None if boot is None else boot.id != "" and self.boot_id == boot.id
 
 
@@ -150,7 +150,7 @@ class CompressorFile:
         self._run: Callable[..., object] = _call_directly
 
     def delegate_to(self, run: Callable[..., object]) -> None:
-        """From now on `run(function, *arguments)` touches the disk: a process that may hang in our place."""
+        """Let `run(function, *arguments)` touch the disk from now on: a process that may hang in our place."""
         self._run = run
 
     def note(self, state: CompressorState) -> None:

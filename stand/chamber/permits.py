@@ -107,7 +107,8 @@ class Permits:
 
     @property
     def ended_ns(self) -> int | None:
-        """When the board's own timer ended heat that is permitted, because it was not renewed; None while it lasts."""
+        """The instant at which the board's own timer ended heat that is permitted, because it was not renewed; None
+        while it lasts."""
         until_ns = self._until_ns.get(HEATER)
         is_over = until_ns is not None and until_ns <= self._clock.now_ns()
         return until_ns if is_over and self.is_granted and self._relays.has_timer else None
@@ -125,14 +126,14 @@ class Permits:
         self.intrusions = 0
 
     async def make_safe(self) -> None:
-        """Both off, confirmed; DeviceError."""
+        """Switch both permits off and confirm it; DeviceError when that fails."""
         self.revoke()
         await self._relays.make_safe()
         self._note_off()
 
     async def switch_off_left_on(self) -> None:
-        """Before anything else: what another daemon or a hand left on is switched off, event `left_on`. A
-        compressor that ran until now begins its rest now."""
+        """Switch off, before anything else, what another daemon or a hand left on, event `left_on`. A compressor that
+        ran until now begins its rest now."""
         left_on = {name for name, on in (await self._read_coils()).items() if on} & set(WATCHED)
         await self._relays.make_safe()
         for channel in sorted(left_on):
@@ -157,8 +158,8 @@ class Permits:
             return coils
 
     async def supervise(self) -> dict[str, bool]:
-        """While the permission is withdrawn: a relay that reads on is switched off, event `switched_off`. Returns what
-        the coils read before that."""
+        """Switch off a relay that reads on while the permission is withdrawn, event `switched_off`. Returns what the
+        coils read before that."""
         async with self._comparing:
             was_withdrawn = self.permission is Permission.WITHDRAWN
             coils = await self._read_coils()
@@ -168,8 +169,8 @@ class Permits:
             return coils
 
     async def test_dead_man(self, *, is_timed: bool) -> None:
-        """Before the heater's relay is trusted: does the board drop it in time, and does arming it again start its time
-        again? DeviceFault when not: such a board would cut the heat at random, or never.
+        """Test, before the heater's relay is trusted, whether the board drops it in time, and whether arming it again
+        starts its time again. DeviceFault when not: such a board would cut the heat at random, or never.
 
         The regulator must be stopped, with an output of 0. Event "dead_man_tested" with what was found; is_timed: the
         board is looked at all the time, and `held_s` is how long after the second arming its relay was seen to drop.
@@ -196,8 +197,9 @@ class Permits:
         raise DeviceFault(self.name, text)
 
     async def _measure_timer(self, is_timed: bool) -> tuple[bool, bool, float | None] | None:
-        """Whether the relay was held by the second arming, whether it then dropped, and after how many s; None when
-        the commands came so late that this says nothing: a second arming after the first one's time arms any board."""
+        """Return whether the relay was held by the second arming, whether it then dropped, and after how many s; None
+        when the commands came so late that this says nothing: a second arming after the first one's time arms any
+        board."""
         pulse_s, sent_ns = self._limits.self_test_s, self._clock.now_ns()
         unit_s, held_s = pulse_s / _PULSE, None
         try:
@@ -282,7 +284,7 @@ class Permits:
         self._until_ns[channel] = until_ns
 
     def _note_off(self) -> None:
-        """Both have been confirmed off."""
+        """Note that both have been confirmed off."""
         self._until_ns.clear()
         if not self.is_granted:
             self.permission = Permission.WITHDRAWN

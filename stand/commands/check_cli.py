@@ -108,7 +108,7 @@ def _format_summary(findings: tuple[Finding, ...], kept: str, *, moves: bool) ->
 
 
 def _is_installed(path: Path) -> bool:
-    """Whether it belongs to the program, whose folder is no place for records."""
+    """Return whether it belongs to the program, whose folder is no place for records."""
     try:
         return path.resolve().is_relative_to(Path(str(importlib.resources.files("thermostand.configs"))).resolve())
     except OSError as error:

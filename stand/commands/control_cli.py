@@ -147,7 +147,7 @@ def _read_latch(config: str) -> LatchedFault | None:
 
 
 def _reset_here(config: str) -> bool:
-    """Whether the stand, which no program has, was latched, and is so no longer; InUse when one has it."""
+    """Return whether the stand, which no program has, was latched, and is so no longer; InUse when one has it."""
     import asyncio
 
     from thermostand.stand.config.stand_config import find_packaged, load_config

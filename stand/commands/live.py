@@ -274,7 +274,7 @@ class PlainLines:
         self._next_share = _TENTH
 
     def show(self, moment: StatusSnapshot) -> None:
-        """When it is time for one."""
+        """Print a line of the state when one is due."""
         if self._is_virtual:
             share = moment.share or 0.0
             if share + 1e-9 < self._next_share:
@@ -303,7 +303,7 @@ class TerminalPanel:
         self._last: StatusSnapshot | None = None
 
     def show(self, moment: StatusSnapshot) -> None:
-        """Four times a second at the most."""
+        """Draw the panel, four times a second at the most."""
         self._last = moment
         if (now_ns := self._clock.now_ns()) >= self._next_ns:
             self._next_ns = now_ns + _BETWEEN_PANELS_NS
@@ -318,7 +318,7 @@ class TerminalPanel:
         self._live.update(Panel(text, title=title, title_align="left", border_style=style), refresh=True)
 
     def tell(self, line: str) -> None:
-        """Above the panel."""
+        """Print a line above the panel."""
         style = "red" if line.startswith("error") else "yellow" if line.startswith("warning") else ""
         self._live.console.print(Text(escape_line(line), style=style), soft_wrap=True)
 

@@ -40,7 +40,7 @@ Tell = Callable[[Event], None]
 
 
 class TokenReloader:
-    """From `begin` on; to be used on the control loop. path: of the tokens, None where no file is named."""
+    """Reloads tokens from `begin` on; to be used on the control loop. path: of the tokens, None where no file is named."""
 
     def __init__(self, path: Path | None, book: TokenStore, now_ns: Callable[[], int], tell: Tell) -> None:
         self._path, self._book = path, book

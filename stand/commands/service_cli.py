@@ -144,7 +144,8 @@ SUBSYSTEM=="tty", SUBSYSTEMS=="usb", OWNER="{user}", MODE="0660", {ignored}
 
 
 def make_tmpfiles(group: str) -> str:
-    """Where the locks of this machine's stands lie (presence.lock_folder)."""
+    """Return the file of tmpfiles.d that makes the folders for the locks and trips of this machine's stands
+    (presence.lock_folder)."""
     return f"""# The locks of stands: only their operators may take one
 d {STANDS_FOLDER} 2770 root {group} -
 # What has tripped, and nobody has reset

@@ -52,7 +52,7 @@ def add(
 
 @app.command("list")
 def list_names(config: ConfigOption = "simulated") -> None:
-    """Who has a token, and who may only look.
+    """List who has a token, and who may only look.
 
     Example: stand token list --config my-stand.yaml
     """

@@ -102,7 +102,7 @@ def _convert_value(typed: Typed, given: object) -> object:
 
 
 def _get_field(name: str, typed: Typed, value: object) -> tuple[str, object]:
-    """Which field gets what."""
+    """Return which field gets which argument."""
     if typed.text_in and (path := Path(str(value))).is_file():
         return typed.text_in, read_document(path)
     return name, value

@@ -407,7 +407,7 @@ def _compute_frames_MB_s(config: StandConfig) -> float:
 
 
 def _check_clock() -> Finding:
-    """Whether the kernel's clock follows a time server (adjtimex)."""
+    """Return whether the kernel's clock follows a time server (adjtimex)."""
     timex = ctypes.create_string_buffer(_TIMEX_BYTES)
     try:
         state = ctypes.CDLL(None).adjtimex(timex)

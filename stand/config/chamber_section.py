@@ -48,10 +48,9 @@ class GraniteCrosscheckConfig(Document):
 
 
 class CameraCrosscheckConfig(Document):
-    """As the granite, by the camera's own temperature: its excess over the air is learned when it has been on for
-    settle_s, and must not grow. A camera that works more when it gives frames needs a wider limit_K. Good sessions:
-    2.6 K beyond half of what lies between air and camera.
-    """
+    """A cross-check as that by the granite, by the camera's own temperature: its excess over the air is learned when it
+    has been on for settle_s, and must not grow. A camera that works more when it gives frames needs a wider limit_K.
+    Good sessions: 2.6 K beyond half of what lies between air and camera."""
 
     settle_s: float = Field(default=2400.0, ge=60, le=14_400)
     # Half of it leaves 0.4 K above what good sessions reach.

@@ -29,7 +29,7 @@ class CheckRecord:
 
 
 def get_record_files(config: Path) -> tuple[Path, Path]:
-    """Where the record of a stand's file is kept: JSON, and HTML for people."""
+    """Return where the record of a stand's file is kept: JSON, and HTML for people."""
     return config.with_name(f"{config.stem}.check.json"), config.with_name(f"{config.stem}.check.html")
 
 

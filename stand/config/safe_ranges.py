@@ -20,7 +20,8 @@ _MOST_K = 1e9  # JSON has no infinity
 
 @dataclass(frozen=True, slots=True)
 class SafeRange:
-    """From `low` to `high` the value at `path` disarms nothing; `reason` is what it would do outside."""
+    """The range from `low` to `high` within which the value at `path` disarms nothing; `reason` is what it would do
+    outside."""
 
     path: str
     unit: str

@@ -421,8 +421,8 @@ def load_config(path: Path) -> StandConfig:
 
 
 def _resolve_camera_files(path: Path, camera: SimulatedCamera) -> SimulatedCamera:
-    """Its GenICam file, and the optics' where they have one, from where the stand's file at `path` is. ConfigError
-    where there are no such optics."""
+    """Resolve the camera's GenICam file, and the optics' where they have one, from where the stand's file at `path` is.
+    ConfigError where there are no such optics."""
     file = None if camera.genicam is None else (path.parent / camera.genicam).absolute()
     optics = camera.optics
     if camera.is_preset:

@@ -213,7 +213,8 @@ def _find_last_outside_s(pv: NDArray[np.float64], to_degC: float, level_K: float
 
 
 def _estimate_time_constant_s(camera: NDArray[np.float64], begin_s: float, end_s: float) -> float:
-    """From three values at equal distances, which needs no final value: exp(-d/tau) = (c - b) / (b - a)."""
+    """Estimate the time constant from three values at equal distances, which needs no final value: exp(-d/tau) = (c -
+    b) / (b - a)."""
     half_s = (end_s - begin_s - _CAMERA_MEAN_S) / 2.0
     if half_s < _CAMERA_MEAN_S:
         return math.nan

@@ -42,7 +42,7 @@ class ConfiguredStand(KnownStand):
         return 60.0 * abs(to_degC - from_degC) / self._config.set_point_K_per_min
 
     def arrival_s(self, from_degC: float, to_degC: float, band_K: float) -> float | None:
-        """None until a recorded run has shown a ramp of this direction."""
+        """Return the time to a set-point; None until a recorded run has shown a ramp of this direction."""
         ramps = self._chamber.heating_ramps if to_degC > from_degC else self._chamber.cooling_ramps
         return self._chamber.arrival_s(from_degC, to_degC, band_K) if ramps else None
 

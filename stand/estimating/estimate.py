@@ -81,7 +81,7 @@ class _Approach:
     captured: bool = False
 
     def after(self, step: Step, duration_s: float) -> _Approach:
-        """When the step is done; a new set-point is taken to find the air at the old one."""
+        """Return when the step is done; a new set-point is taken to find the air at the old one."""
         if isinstance(step, StartChamber | SetTemperature):
             return _Approach(self.to_degC, step.chamber_degC, duration_s)
         # A soak that waits for the camera has time enough when its longest is enough.
@@ -170,7 +170,7 @@ def _explain_dark_capture(step: Step, found: Situation) -> str:
 
 
 def _find_warning(step: Step, approach: _Approach, chamber: ChamberModel, expected_s: float) -> str:
-    """Of the first capture at a set-point: what is wrong when the camera cannot have followed until then. Of a
+    """Return what is wrong with the first capture at a set-point, when the camera cannot have followed until then. Of a
     cool-down: that it is too short for a camera that was on. Of a soak that is expected to take expected_s: that it
     will not end in its time."""
     if isinstance(step, CoolDown):

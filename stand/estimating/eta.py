@@ -93,8 +93,8 @@ class Eta:
         return self._expected_s[step_id]
 
     def ends_s(self, now_ns: int) -> dict[str, float]:
-        """From `now_ns` until each step that is under way or to come is expected to be done, s, by its id: what follows
-        the last one is what `left_s` has besides."""
+        """Return the time from `now_ns` until each step that is under way or to come is expected to be done, s, by its
+        id: what follows the last one is what `left_s` has besides."""
         ends: dict[str, float] = {}
         at_s = 0.0
         if self._running is not None:
@@ -139,7 +139,8 @@ class Eta:
             self._after_s = 0.0
 
     def left_s(self, now_ns: int) -> float:
-        """From `now_ns` until the plan and what follows it are done, s; a pause under way is taken to end now."""
+        """Return the time from `now_ns` until the plan and what follows it are done, s; a pause under way is taken to
+        end now."""
         left_s = self._stated_s + sum(count * self._overhead_s[work] for work, count in self._count.items())
         if self._running is not None:
             left_s += max(0.0, self._from_now_s(self._running) - self._progress_s(now_ns))
@@ -186,7 +187,7 @@ class Eta:
         self._count[step.work] += 1
 
     def _forget(self, index: int) -> bool:
-        """Whether the step was waited for."""
+        """Return whether the step was waited for."""
         waiting = self._waiting.pop(index, None)
         if waiting is not None:
             self._stated_s -= waiting.stated_s

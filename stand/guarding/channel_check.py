@@ -200,7 +200,7 @@ class ChannelCheck:
         return [(channel, now)] if now is not None and is_new else []
 
     def _follow(self, seen: _ChannelState, nature: ChannelModel, value: float, time_ns: int) -> None:
-        """Where what it follows has been since it last changed, and since when that is at rest."""
+        """Return where what it follows has been since it last changed, and since when that is at rest."""
         if value != seen.value:
             seen.changed_ns, seen.went_ns, seen.followed_degC = time_ns, None, (math.inf, -math.inf)
         followed_degC = self._get_trusted_degC(nature.follows)

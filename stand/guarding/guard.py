@@ -70,7 +70,7 @@ class Guard:
     _warned: set[int] = field(default_factory=set[int])  # watches whose warning stands
 
     def look(self) -> bool:
-        """Whether the run continues; False when the run is being aborted."""
+        """Return whether the run continues; False when the run is being aborted."""
         self._check_own_timing()
         faults = self._check_rules()
         fault = next((each for each in faults if each.action == "abort" or self.hold is None), None)
@@ -86,8 +86,8 @@ class Guard:
         self.look()
 
     def may_permit(self) -> bool:
-        """Whether heat and cold may be permitted for another while: the guard looks, finds all well, and has fresh
-        readings."""
+        """Return whether heat and cold may be permitted for another while: the guard looks, finds all well, and has
+        fresh readings."""
         if self._ended or self.held is not None or self._looked_ns is None:
             return False
         if self.clock.now_ns() - self._looked_ns > LATE_PERIODS * to_ns(self.period_s):
@@ -117,8 +117,8 @@ class Guard:
         self._update_hold(self._check_rules())
 
     def describe_remaining_faults(self) -> str:
-        """For who has just reset: what holds the stand again, or will once it has lasted for its grace time; "" when
-        no rule objects to anything."""
+        """Return, for an operator who has just reset, what holds the stand again, or will once it has lasted for its
+        grace time; "" when no rule objects to anything."""
         if self.held is not None:
             return f"held again: {self.held.text}"
         lasting = [

@@ -96,7 +96,7 @@ def require_fresh_reading(channel: str, stale_after_s: float) -> Rule:
 
 
 def limit_disagreement(channel: str, other: str, max_K: float) -> Rule:
-    """Two sensors of the same air differ by more than `max_K`."""
+    """Make the rule that objects when two sensors of the same air differ by more than `max_K`."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         value_degC, other_degC = get_value(readings, channel), get_value(readings, other)
@@ -267,7 +267,8 @@ class Recording(Protocol):
 
     @property
     def waiting_since_ns(self) -> int | None:
-        """When the oldest item was published that is not yet durable in the session's own folder; None: nothing due."""
+        """The instant at which the oldest item was published that is not yet durable in the session's own folder; None:
+        nothing due."""
         ...
 
     @property

@@ -48,7 +48,7 @@ class FollowingBody:
         self._looked_ns: int | None = None
 
     def __call__(self, readings: Readings, now_ns: int) -> tuple[float, ...]:
-        """As WarmAround: where it has come to by now."""
+        """Return where the body has come to by now, as WarmAround does."""
         air_degC, before_ns = get_value(readings, self._air), self._looked_ns
         self._looked_ns = now_ns
         if before_ns is not None and not math.isnan(air_degC):

@@ -276,8 +276,9 @@ def _watch_temperatures(config: StandConfig) -> tuple[Watch, ...]:
 
 
 def _watch_heat(config: StandConfig, seen: SensorHistory) -> tuple[Watch, ...]:
-    """Heat that does not come, comes unasked, or is held back. The first may be a detached sensor, the second is out
-    of control; a relay that does not close or answer, or a compressor that does not cool, can be put right."""
+    """Make the rules about heat that does not come, comes unasked, or is held back. The first may be a detached sensor,
+    the second is out of control; a relay that does not close or answer, or a compressor that does not cool, can be put
+    right."""
     limits = config.guard
     return (
         Watch(
@@ -496,8 +497,9 @@ def _watch_contacts(config: StandConfig) -> tuple[Watch, ...]:
 
 
 def watch_recording(config: StandConfig, recording: Recording) -> tuple[Watch, ...]:
-    """Heat only while it is recorded. A disk that hangs or refuses may work again by itself; a folder that was moved
-    does not come back by itself. A run whose writer was killed is ended, and resumed by itself (writer_restarts.py)."""
+    """Make the rules by which heat is given only while it is recorded. A disk that hangs or refuses may work again by
+    itself; a folder that was moved does not come back by itself. A run whose writer was killed is ended, and resumed by
+    itself (writer_restarts.py)."""
     return (
         Watch(require_recording_process(recording)),
         Watch(require_session_folder(recording), action="hold"),

@@ -94,7 +94,7 @@ class SensorHistory:
                 del column[0]
 
     def find_suspect(self, pair: tuple[str, str], readings: Readings) -> Suspicion:
-        """Which of both moved unlike the rest."""
+        """Find which of both moved unlike the rest."""
         suspects = [name for name in pair if is_suspect(readings, name)]
         if len(suspects) == 1:
             return Suspicion(suspects[0])
@@ -134,7 +134,7 @@ class SensorHistory:
     def _weigh_witness(
         self, witness: str, pair: tuple[str, str], now: Mapping[str, float], begin: int | None, readings: Readings
     ) -> str:
-        """Which of both the other sensor contradicts, "" for none."""
+        """Return which of both the other sensor contradicts, "" for none."""
         seen = _get_trusted_value(readings, witness)
         if math.isnan(seen):
             return ""
@@ -199,8 +199,8 @@ class SensorHistory:
         return unfelt[0] if len(unfelt) == 1 and max(fallen_K.values()) >= _MOVED_K else ""
 
     def _judge_by_rest(self, pair: tuple[str, str], now: Mapping[str, float], begin: int) -> str:
-        """From air at rest: the one of both that moved though nothing that moves it has changed, or the one that stayed
-        though the heat has."""
+        """Judge from air at rest: return the one of both that moved though nothing that moves it has changed, or the
+        one that stayed though the heat has."""
         first = next((i for i, time_s in enumerate(self._times_s) if time_s >= self._times_s[begin] - _BEFORE_S), begin)
         before = [self._values[name][first : begin + 1] for name in pair]
         rest_percent = self._percent[first : begin + 1]
@@ -246,7 +246,7 @@ def _get_trusted_value(readings: Readings, channel: str) -> float:
 
 
 def _fit_trend(points: Sequence[tuple[float, float]]) -> float:
-    """Least squares, K/s; 0 with fewer than five points."""
+    """Fit a slope by least squares, K/s; 0 with fewer than five points."""
     if len(points) < 5:
         return 0.0
     middle_s = sum(time_s for time_s, _ in points) / len(points)

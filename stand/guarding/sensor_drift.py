@@ -75,7 +75,7 @@ def limit_sensor_drift(
         return _HeldSetPoint(held.key, now_ns - to_ns(_STILL_AFTER_S), first=known, fault=fault)
 
     def _suspicion(changes_K: Sequence[float]) -> Suspicion:
-        """By the thirds, each of which has to be nearer to one of both by twice."""
+        """Judge by the thirds, each of which has to be nearer to one of both by twice."""
         of_channel, of_other = list[str](), list[str]()
         for third, from_channel_K in zip(thirds, changes_K[1:], strict=True):
             from_other_K = from_channel_K - changes_K[0]

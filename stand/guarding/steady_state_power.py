@@ -33,7 +33,7 @@ class RestState:
 
 @dataclass(frozen=True, slots=True)
 class PowerState:
-    """At rest since `since_ns`, the output summed over `count` looks since `begun_ns`; what was learned, %."""
+    """A state at rest since `since_ns`, the output summed over `count` looks since `begun_ns`; what was learned, %."""
 
     rest: RestState | None = None
     since_ns: int = 0

@@ -48,7 +48,8 @@ _UNREAD = _ErrorRule("", DeviceError, DEVICE_LOST)  # of what is never polled: n
 
 
 class StepErrors:
-    """Those that steps have met and that count still. A subscriber of the hub. kinds: of the devices, by name."""
+    """The device errors that steps have met and that count still. A subscriber of the hub. kinds: of the devices, by
+    name."""
 
     def __init__(self, kinds: Mapping[str, str]) -> None:
         self._kinds = kinds

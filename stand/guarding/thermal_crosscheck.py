@@ -155,7 +155,7 @@ class CameraState:
     excess_K: float | None = None
 
     def is_implausible(self, air_degC: float) -> bool:
-        """Whether the camera did not notice what the air did."""
+        """Return whether the camera did not notice what the air did."""
         still_ns = self.looks[-1].time_ns - self.changed_ns if self.looks else 0
         moved_K = abs(air_degC - self.changed_air_degC)
         return still_ns >= to_ns(_CAMERA_WINDOW_S) and moved_K >= _STILL_AIR_K

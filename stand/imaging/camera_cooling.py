@@ -21,7 +21,8 @@ class CameraTemperature:
     time_ns: int
 
     def after(self, time_ns: int, air_degC: float, time_constant_s: float) -> CameraTemperature:
-        """At `time_ns`, when the air has been at `air_degC` meanwhile: the excess over it has decayed exponentially."""
+        """Return the temperature at `time_ns`, when the air has been at `air_degC` meanwhile: the excess over it has
+        decayed exponentially."""
         decayed = math.exp(-(time_ns - self.time_ns) / NS_PER_S / time_constant_s)
         return CameraTemperature(air_degC + (self.camera_degC - air_degC) * decayed, time_ns)
 

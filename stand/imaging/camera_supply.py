@@ -78,7 +78,7 @@ class CameraSupply:
         self.equilibrium.begin()
 
     def publish_identities(self) -> None:
-        """Which cameras are on, for the recording; nothing when one was lost meanwhile."""
+        """Publish which cameras are on, for the recording; nothing when one was lost meanwhile."""
         if self._cameras.is_usable:
             for event in self._cameras.identities(self._clock.now_ns()):
                 self._hub.publish(event)
@@ -98,8 +98,8 @@ class CameraSupply:
         await cool_down(self.last, band_K, time_constant_s, max_s, self._hub, self._clock)
 
     async def restore(self) -> None:
-        """After the equilibrium was lost: the supply on, should it be off, and the camera open; tried for 30 min, the
-        gate being held. Nothing on a stand without cameras."""
+        """Switch the supply on again after the equilibrium was lost, should it be off, and open the camera; tried for
+        30 min, the gate being held. Nothing on a stand without cameras."""
         if self.is_on or not self._cameras.names:
             return
         deadline_ns = self._clock.now_ns() + to_ns(LOST_LIMIT_S)

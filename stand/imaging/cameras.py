@@ -29,7 +29,7 @@ class Cameras:
         return "; ".join(camera.restarted for camera in self._cameras if camera.restarted)
 
     def identities(self, now_ns: int) -> tuple[Event, ...]:
-        """Which have answered, as events; Unreachable when one is not open."""
+        """Return which cameras have answered, as events; Unreachable when one is not open."""
         return tuple(make_identity_event(each.name, each.identity, now_ns, each.settings) for each in self._cameras)
 
     async def open(self) -> None:

@@ -111,7 +111,7 @@ class Imaging:
         return None
 
     async def _grab(self, exposure_s: float, due_ns: int = 0, names: Collection[str] = ()) -> tuple[Frame, ...]:
-        """In virtual time a grab takes none: what exposes is not exposed again meanwhile."""
+        """Grab frames; in virtual time a grab takes none: what exposes is not exposed again meanwhile."""
         if self._clock.now_ns() < self._exposed_ns:
             await self._clock.sleep_until(self._exposed_ns)
         cameras = [camera for name, camera in self._cameras.items() if not names or name in names]

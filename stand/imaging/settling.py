@@ -80,7 +80,8 @@ class Verdict:
 
 
 def judge_settling(seen: SettlingData, soak: SoakUntilSettled, now_s: float) -> Verdict:
-    """Whether the camera has settled, by the last `soak.window_s` before `now_s`; the soak's age is not judged."""
+    """Return whether the camera has settled, by the last `soak.window_s` before `now_s`; the soak's age is not
+    judged."""
     camera = fit_camera_rate(_select_last(seen.camera, now_s - soak.window_s), seen.digit_K)
     slack_s = soak.look_every_s / 2.0
     looks = seen.looks[seen.looks[:, 0] >= now_s - soak.window_s - slack_s]
@@ -180,7 +181,7 @@ def _select_last(readings: Float, begin_s: float) -> Float:
 
 
 def _covers(readings: Float, begin_s: float) -> bool:
-    """Whether something was read before `begin_s`, too, so that the whole window is seen."""
+    """Return whether something was read before `begin_s`, too, so that the whole window is seen."""
     return readings.shape[1] > 0 and bool(readings[0, 0] <= begin_s)
 
 

@@ -29,7 +29,7 @@ async def approach(axis: Axis, position: float) -> None:
 
 
 async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HOME_RESIDUAL_LIMIT_STEPS) -> float:
-    """Home again; the residual in mm or deg: how far the scale was off since the axis was last homed.
+    """Home again and return the residual in mm or deg: how far the scale was off since the axis was last homed.
 
     Event "home_residual", or the warning "home_residual_large" beyond `limit_steps` full steps: captures since the last
     good home are then suspect. An axis that has lost its scale is homed without a residual (NaN, event "homed").
@@ -52,7 +52,7 @@ async def check_home(axis: Axis, hub: Hub, clock: Clock, limit_steps: float = HO
 
 
 async def prepare_axes(axes: Mapping[str, Axis], commanded: Mapping[str, float], hub: Hub, clock: Clock) -> None:
-    """Before a capture, approach again, from below, each axis whose position cannot be relied upon.
+    """Approach again, before a capture and from below, each axis whose position cannot be relied upon.
 
     `commanded`: where the plan put each axis it moved (mm or deg); the others are left alone. An axis is uncertain when
     its motor is without current, its scale is lost, or it stands a step or more elsewhere (stopped by hand); event
@@ -85,7 +85,7 @@ class Table:
         self._commanded: dict[str, float] = {}  # axis -> mm or deg, where the plan put it last
 
     def forget_positions(self) -> None:
-        """No plan has put any stage anywhere: the run that did is over."""
+        """Forget the plan's positions: the run that put the stages there is over."""
         self._commanded.clear()
 
     async def move_to(self, axis: str, position: float) -> None:
@@ -116,7 +116,7 @@ class Table:
         await self._axis(axis).stop()
 
     async def approach_again(self) -> None:
-        """Before frames: approach again, from below, each stage whose motor has been switched off since its move."""
+        """Approach again, before frames and from below, each stage whose motor has been switched off since its move."""
         self._interlock.check()
         with self._motions.under_way("stages", "back to the plan's positions, where they are elsewhere"):
             await prepare_axes(self._axes, self._commanded, self._hub, self._clock)

@@ -399,5 +399,5 @@ def _load_order(session: Session, first: Begun) -> Order:
 
 
 def is_of_virtual_time(before: Interruption | None) -> bool:
-    """Whether an interrupted run was one in virtual time, in which it is then resumed."""
+    """Return whether an interrupted run was one in virtual time, in which it is then resumed."""
     return before is not None and before.info.clock_source == "virtual"

@@ -75,8 +75,9 @@ _FOLLOWS_K = 1.0  # the set-point follows the laboratory in such steps
 # The end of a run and no step of its plan, so that plans, ids and hashes stay; on by default, off on the simulated
 # stand.
 async def bring_to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandConfig) -> None:
-    """Until it is done, `ending.max_s` are over, or it is cancelled; a hold is waited for. Events: `to_ambient`, and
-    `at_ambient` or `not_at_ambient` (a warning). Nothing happens on a stand that is there, or is not asked to."""
+    """Bring the chamber to ambient until it is done, `ending.max_s` are over, or it is cancelled; a hold is waited for.
+    Events: `to_ambient`, and `at_ambient` or `not_at_ambient` (a warning). Nothing happens on a stand that is there, or
+    is not asked to."""
     lacks = _describe_not_ambient(hub, config)
     if not config.ending.to_ambient or not lacks:
         return
@@ -110,7 +111,7 @@ async def bring_to_ambient(stand: Stand, hub: Hub, clock: Clock, config: StandCo
 
 
 def _compute_ambient_degC(hub: Hub, config: StandConfig) -> float:
-    """Where to, within the stand's limits."""
+    """Return the temperature to end at, within the stand's limits."""
     measured_degC = get_value(hub, LABORATORY)
     low_degC, high_degC = config.set_points_degC
     wanted_degC = config.ending.ambient_degC if math.isnan(measured_degC) else measured_degC
@@ -322,9 +323,9 @@ class Run:
         return course
 
     def _make_begin_data(self) -> dict[str, object]:
-        """For a resume: whether the host has run on since, and which plan it is, should the journal have lost that. For
-        counts of what is done: how many steps and frames the plan has. For who watches: the session. Which packages
-        have made steps of it."""
+        """Return, for a resume, whether the host has run on since, and which plan it is, should the journal have lost
+        that. For counts of what is done: how many steps and frames the plan has. For who watches: the session. Which
+        packages have made steps of it."""
         plan, boot = hash_plan(self.job.order.recipe.plan()), get_boot(self._assembly.clock)
         names = {"recipe": self.job.order.recipe.name, "session": self.recorder.directory.name}
         data: dict[str, object] = {**self.log.state.size, "plan": plan, "seed": self.job.seed, **names}

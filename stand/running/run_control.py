@@ -169,7 +169,7 @@ class RunControl:
         }
 
     def go_on(self) -> None:
-        """No pause, and none to come."""
+        """End the pause, and any that was to come."""
         self.pauses_next, self._prompt = False, None
         self.assembly.stand.gate.clear(OPERATOR)
 

@@ -42,7 +42,7 @@ def choose_session_directory(out: Path, order: Order, clock: Clock) -> Path:
 def make_session_info(
     recipe: str, session: str, config: StandConfig, camera_serial: str, clock: Clock, seed: int | None = None
 ) -> SessionInfo:
-    """Who records what with which; `seed`: of a run in virtual time."""
+    """Make the description of who records what with which; `seed`: of a run in virtual time."""
     is_virtual = isinstance(clock, VirtualClock)
     return SessionInfo(
         session_id=session,
@@ -58,13 +58,13 @@ def make_session_info(
 
 
 def list_camera_serials(assembly: Assembly) -> str:
-    """Which cameras have answered; "" on a stand without any."""
+    """List which cameras have answered; "" on a stand without any."""
     return ", ".join(camera.identity.serial_number for camera in assembly.devices.cameras.values())
 
 
 def publish_identities(assembly: Assembly, tell: Callable[[Event], None]) -> None:
-    """Which devices have answered, as events, but for the cameras, which are reported when they are on; and what the
-    stand lacks. tell: gets them."""
+    """Publish which devices have answered, as events, but for the cameras, which are reported when they are on; and
+    what the stand lacks. tell: gets them."""
     devices, now_ns = assembly.devices, assembly.clock.now_ns()
     for name, device in devices.every.items():
         if name not in devices.cameras and device.identity is not None:
@@ -108,14 +108,15 @@ def make_recorder(
 
 
 def _compute_commit_s(recording: RecordingConfig, clock: Clock) -> float:
-    """Between commits of telemetry: on a virtual clock few, but nothing waits for half of what a guard allows."""
+    """Return the time between commits of telemetry: on a virtual clock few, but nothing waits for half of what a guard
+    allows."""
     if isinstance(clock, VirtualClock):
         return min(VIRTUAL_COMMIT_S, recording.durable_within_s / 3)
     return min(recording.telemetry_commit_s, recording.durable_within_s / 3)
 
 
 def _make_marker_windows(order: Order) -> MarkerWindows | None:
-    """For `roi`: what keeps the surroundings of the target's markers."""
+    """Make, for `roi`, what keeps the surroundings of the target's markers."""
     recording = order.config.recording
     if recording.frame_encoding != "roi":
         return None

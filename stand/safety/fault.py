@@ -27,7 +27,7 @@ class Readings(Protocol):
         ...
 
     def last_good_ns(self, channel: str) -> int | None:
-        """When the channel was last measured, GOOD or with a suspect value."""
+        """Return when the channel was last measured, GOOD or with a suspect value."""
         ...
 
 
@@ -61,7 +61,7 @@ class Fault:
         return {"action": self.action, "ends_itself": self.ends_itself, **(compared if self.channels else {})}
 
     def make_event(self, time_ns: int) -> Event:
-        """That the rule objects, as an event."""
+        """Make the event that the rule objects."""
         return get_guard_kind(self.rule).at(time_ns, self.text, rule=self.rule, **self.data)
 
 
@@ -107,6 +107,6 @@ def get_value(readings: Readings, channel: str) -> float:
 
 
 def is_suspect(readings: Readings, channel: str) -> bool:
-    """Whether its last value is not to be believed."""
+    """Return whether its last value is not to be believed."""
     reading = readings.known(channel)
     return reading is not None and reading.cause == "suspect"

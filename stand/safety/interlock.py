@@ -19,7 +19,7 @@ class Mover(Protocol):
     """A flap or an axis, which making safe bars from moving."""
 
     def allow(self) -> None:
-        """New commands may move it again."""
+        """Allow new commands to move it again."""
         ...
 
 
@@ -60,7 +60,7 @@ class Motions:
         return tuple(dict(self._under_way.values()))
 
     def moves(self, name: str) -> bool:
-        """Whether this one is under way."""
+        """Return whether this one is under way."""
         return name in self.names
 
     @contextmanager

@@ -63,8 +63,8 @@ class Latch:
         self._clock = clock
 
     def trip(self, fault: Fault) -> None:
-        """On the disk first, but for what ends by itself; waits for WITHIN_S at most. A fault that stays is since when
-        it was found first."""
+        """Latch the trip, on the disk first, but for what ends by itself; waits for WITHIN_S at most. A fault that
+        stays is since when it was found first."""
         now_ns = self._clock.now_ns()
         since_ns = now_ns if self.fault is None or self.fault.rule != fault.rule else self.since_ns
         failure = "" if self.file is None or fault.ends_itself else self.file.keep(fault, since_ns)
@@ -127,7 +127,8 @@ class LatchFile:
         return self._run_within_limit(_remove)
 
     def reset(self) -> None:
-        """As `forget`, however long it takes; SessionError when a file cannot be removed: the stand stays latched."""
+        """Forget the trip as `forget` does, however long it takes; SessionError when a file cannot be removed: the
+        stand stays latched."""
         try:
             _remove(self._paths)
         except OSError as error:

@@ -165,7 +165,7 @@ class Safety:
             maker.demand()
 
     def take(self, actuator: SafetyActuator, pause_s: float = _PAUSE_S) -> None:
-        """From now on this actuator, too, is made safe with each demand, and again after `pause_s` while it does not
+        """Make this actuator, too, safe with each demand from now on, and again after `pause_s` while it does not
         confirm."""
         self._makers = (*self._makers, _SafeStateTask(actuator, pause_s, self._clock, self._on_change))
 
@@ -186,7 +186,7 @@ class Safety:
         return self._given_up
 
     def reset_give_up(self) -> None:
-        """Who did not want to wait for one confirmation may want to for the next."""
+        """Wait for confirmations again: an operator who did not want to wait for one may want to for the next."""
         self._given_up = False
 
     def cancel_pending(self) -> None:
@@ -210,8 +210,8 @@ class Safety:
             await self._changed.wait()
 
     async def wait_until_confirmed(self, limit_s: float) -> bool:
-        """Whether everything is confirmed within that time, on the stand's clock, and before an operator gives up; an
-        event says what is not, after a minute and then each time in twice as long."""
+        """Return whether everything is confirmed within that time, on the stand's clock, and before an operator gives
+        up; an event says what is not, after a minute and then each time in twice as long."""
         end_ns, wait_s = self._clock.now_ns() + to_ns(limit_s), _REPORTED_AFTER_S
         await self.wait_until_tried()
         while not self.is_confirmed and not self._given_up and self._clock.now_ns() < end_ns:

@@ -129,7 +129,7 @@ class Daemon(Host):
 
     @property
     def has_run(self) -> bool:
-        """From the moment a run is let in until it has gone."""
+        """Whether a run is in the stand, from the moment it is let in until it has gone."""
         return self.has_admitted_run
 
     @property
@@ -151,7 +151,7 @@ class Daemon(Host):
         return self._orders.list_runs()
 
     def wake(self) -> None:
-        """There may be something to be run."""
+        """Look at the queue: it may have something to run."""
         self._wake.set()
 
     def leave(self) -> None:
@@ -375,8 +375,8 @@ class Daemon(Host):
         return replace(before, salvaged=(*salvaged, *before.salvaged))
 
     async def _record_idle(self) -> None:
-        """Heat depends on the record between runs while no run records; a disk that refuses it is an event, and
-        there is no heat by hand."""
+        """Record between runs, on which heat by hand depends; a disk that refuses it is an event, and no heat by hand
+        is permitted."""
         self._recorded_ns = self._clock.now_ns()
         try:
             self.open_stand.recorder = await self.record.get_current()
@@ -433,7 +433,7 @@ class Daemon(Host):
         return bool(recorder.writer_ended) and waited_s >= _ENDED_AGAIN_S
 
     def _is_midnight(self) -> bool:
-        """Whether the record is of yesterday; what the disk has refused is tried again after a while."""
+        """Return whether the record is of yesterday; what the disk has refused is tried again after a while."""
         recorder, waited_ns = self.record.recorder, self._clock.now_ns() - self._turned_ns
         is_of_yesterday = recorder is not None and not recorder.writer_ended and not self.record.is_of_today()
         return is_of_yesterday and waited_ns >= _KEEP_EVERY_S * NS_PER_S

@@ -124,7 +124,7 @@ class Host:
             self.guest.stop()
 
     def wake(self) -> None:
-        """There may be something to be run."""
+        """Look at the queue: it may have something to run."""
 
     def note(self) -> None:
         """Write down what the next one who has the stand has to know."""

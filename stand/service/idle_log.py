@@ -84,7 +84,7 @@ class IdleLog:
         return None if self._now is None else self._now.recorder
 
     def is_of_today(self) -> bool:
-        """Whether midnight has not passed since it was begun."""
+        """Return whether midnight has not passed since it was begun."""
         return self._day == self._get_today()
 
     async def begin(self) -> Recorder:
@@ -159,7 +159,7 @@ class IdleLog:
         return next(info for name in names if (info := self._read_info(self._out / name)) is not None)
 
     def _read_info(self, directory: Path) -> SessionInfo | None:
-        """Who records there: as before, where that can be; None where it cannot."""
+        """Return who records there: as before, where that can be; None where it cannot."""
         info = self._make_info(directory.name)
         if not os.path.lexists(directory):
             return info

@@ -94,7 +94,7 @@ class ManualControl:
         return self._run_then_read(name, self._stand.table.move_to(name, position))
 
     def stop_axis(self, name: str) -> Work:
-        """Where it is."""
+        """Stop the axis where it is."""
         return self._run_then_read(name, self._stand.table.stop(name))
 
     def home_axis(self, name: str) -> Work:
@@ -115,7 +115,8 @@ class ManualControl:
         return self._stand.imaging.take_frame(exposure_s, "")
 
     async def _run_then_read(self, axis: str, work: Work) -> None:
-        """Who waits for the end of an order sees where the stage is, not where it was when it was polled last."""
+        """Run an order, then read the stage: who waits for its end sees where it is, not where it was when it was
+        polled last."""
         await work
         with suppress(DeviceError):  # the poller tells
             readings = await self._stand.devices.axes[axis].read()

@@ -124,7 +124,7 @@ class QueueDraft:
         self.set(entries=tuple(entry if old.id == entry.id else old for old in self.queue.entries))
 
     def set(self, **changes: object) -> None:
-        """Other fields of the queue."""
+        """Set other fields of the queue."""
         self.queue = self.queue.model_copy(update=changes)
 
 

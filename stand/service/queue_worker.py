@@ -210,7 +210,7 @@ def load_queued_interruption(session: Path, own: StandConfig, *, reset: bool = F
 
 
 def is_complete(session: Path) -> bool:
-    """Whether the run recorded in `session` came to its end; Halt when its journal does not say."""
+    """Return whether the run recorded in `session` came to its end; Halt when its journal does not say."""
     try:
         journal, entries = Journal.open(session)
     except SessionError as error:

@@ -423,7 +423,7 @@ def describe_pause(when: When) -> str:
 
 
 def describe_hold(reasons: Collection[str]) -> str:
-    """Whether the run continues, and if not, what may be done about it."""
+    """Return whether the run continues, and if not, what may be done about it."""
     if not reasons:
         return "the run continues"
     known = [ENDINGS[reason] for reason in sorted(reasons) if reason in (OPERATOR, INTERLOCK)]

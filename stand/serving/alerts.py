@@ -47,9 +47,9 @@ class AlertMessage(NamedTuple):
 
 @dataclass
 class AlertTracker:
-    """Which messages are due. Of one cause and key there is one message until it is over; a run's begin or end, and
-    what has no end, are sent each time. With more than most_per_h in an hour only trips are sent, and how many were
-    left out."""
+    """The tracker of messages that are due. Of one cause and key there is one message until it is over; a run's begin
+    or end, and what has no end, are sent each time. With more than most_per_h in an hour only trips are sent, and how
+    many were left out."""
 
     name: str
     causes: Collection[AlertCause]
@@ -320,7 +320,7 @@ class _Delivery:
                 return
 
     def _try(self, due: _Waiting, *, is_last: bool) -> None:
-        """Who has taken a message does not get it again because another one has not."""
+        """Try to deliver; a receiver that has taken a message does not get it again because another one has not."""
         if boot_time_ns() < due.at_ns and not is_last:
             self._waiting.append(due)
             return

@@ -80,7 +80,7 @@ class DaemonInstance:
                 raise SessionError(f"{path.parent}: no control socket can be made there ({error.strerror})") from error
 
     def is_published(self) -> bool:
-        """Whether its files are still there; a logout removes $XDG_RUNTIME_DIR with all that is in it."""
+        """Return whether its files are still there; a logout removes $XDG_RUNTIME_DIR with all that is in it."""
         with self._lock, suppress(OSError):
             return (
                 self._file is not None

@@ -25,8 +25,8 @@ HERE = "127.0.0.1"
 def make_interface(
     config: StandConfig, sessions: Path, host: str = HERE, port: int | None = None, secop: int | None = None
 ) -> Interface:
-    """As the stand's file has it, but for the ports that are given. ConfigError when the network could operate the
-    stand without a token, or nobody can listen there: before a device is opened."""
+    """Make the interface as the stand's file has it, but for the ports that are given. ConfigError when the network
+    could operate the stand without a token, or nobody can listen there: before a device is opened."""
     settings = config.interface
     trusts, port = settings.trust_loopback, settings.port if port is None else port
     secop = settings.secop_port if secop is None else secop

@@ -78,7 +78,7 @@ class Columns:
 
 
 def _round_numbers(values: Float) -> list[float | None]:
-    """Four decimals are a tenth of a millikelvin and of a millipixel: more would only be bytes."""
+    """Round to four decimals, a tenth of a millikelvin and of a millipixel: more would only be bytes."""
     rounded = np.round(values.astype(np.float64), 4).tolist()
     return [None if value != value else value for value in rounded]
 
@@ -113,7 +113,7 @@ class _Ring:
             self._high[row, at] = high
 
     def fill(self, row: int, times_ns: Times, values: NDArray[np.floating]) -> None:
-        """Many readings at once, in order of time."""
+        """Add many readings at once, in order of time."""
         cells = times_ns // self.width_ns
         if len(cells) and cells[-1] > self.newest:
             self._advance_to(int(cells[-1]))
@@ -123,7 +123,7 @@ class _Ring:
         np.maximum.at(self._high[row], at, np.nan_to_num(values, nan=-_BAD))
 
     def merge(self, row: int, other: _Ring, other_row: int) -> None:
-        """Another ring's channel of the same cells, as far as they are not too old."""
+        """Merge another ring's channel of the same cells, as far as they are not too old."""
         if other.newest > self.newest:
             self._advance_to(other.newest)
         numbers = np.arange(max(other.newest, self.newest) - self.cells + 1, other.newest + 1)
@@ -201,7 +201,7 @@ class History:
         return tuple(self._rows)
 
     def get_last_ns(self, channel: str) -> int | None:
-        """When the latest reading of a channel was made, None when there is none."""
+        """Return when the latest reading of a channel was made, None without any."""
         return self._last_ns.get(channel)
 
     def add(self, channel: str, time_ns: int, value: float, unit: str) -> None:
@@ -213,7 +213,7 @@ class History:
                 ring.add(row, time_ns, value)
 
     def fill(self, channel: str, times_ns: Times, values: NDArray[np.floating], unit: str) -> None:
-        """Many values of a channel, in order of time, NaN for those that are BAD; shape (n,) both."""
+        """Add many values of a channel, in order of time, NaN for those that are BAD; shape (n,) both."""
         row = self._row(channel, unit)
         if row is not None and len(times_ns):
             self._last_ns[channel] = max(int(times_ns[-1]), self._last_ns.get(channel, 0))
@@ -254,7 +254,7 @@ class History:
                 return
 
     def reference(self, camera: str, time_ns: int) -> None:
-        """From then on, count the drift of this camera from another frame."""
+        """Count the drift of this camera from another frame from then on."""
         self._references.append(Mark(time_ns, "reference", camera, ""))
 
     def columns(self, from_ns: int, to_ns: int, points: int = 1200, channels: Collection[str] | None = None) -> Columns:

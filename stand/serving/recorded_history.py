@@ -18,8 +18,8 @@ WEEK_NS = to_ns(COARSE_S * COARSE_CELLS)
 
 
 def read_recorded_week(directory: Path, now_ns: int) -> tuple[History, list[str]]:
-    """After a restart: what the sessions in `directory` have of the week before `now_ns`, and a sentence for each that
-    could not be read."""
+    """Return, after a restart, what the sessions in `directory` have of the week before `now_ns`, and a sentence for
+    each that could not be read."""
     history, troubles = History(), list[str]()
     for path in _find_sessions_since(directory, now_ns - WEEK_NS):
         try:

@@ -215,7 +215,7 @@ class Node:
         )
 
     def is_stop(self, request: SecopRequest) -> bool:
-        """Whether this is STOP, which nothing may delay."""
+        """Return whether this is STOP, which nothing may delay."""
         module, name = request.place
         command = self.modules[module].commands.get(name) if module in self.modules else None
         return request.action == "do" and command is not None and command.is_stop

@@ -28,5 +28,5 @@ class FrameShot:
 
 
 def is_reference(role: str, before: str, *, is_first: bool) -> bool:
-    """Whether drift counts from a frame of this role on, the one looked at before being of role `before`."""
+    """Return whether drift counts from a frame of this role on, the one looked at before being of role `before`."""
     return role in DRIFT_ROLES and (is_first or role == Role.REFERENCE != before)

@@ -81,8 +81,9 @@ class DriftNode(Node):
         self._points.publish(out)
 
     def _on_camera_info(self, message):
-        """Of K only: what is rectified with it comes to where it was at the reference. P, and with it the rectified
-        image, stays. The turn about the optical axis has no place in K, and is left out."""
+        """Publish camera info with K changed alone: what is rectified with it comes to where it was at the reference.
+        P, and with it the rectified image, stays. The turn about the optical axis has no place in K, and is left out.
+        """
         k = self._drift.intrinsics(np.array(message.k, float).reshape(3, 3))
         if np.isfinite(k).all():
             k[1, 0] = 0.0
@@ -110,7 +111,7 @@ def _seconds(stamp):
 
 
 def main():
-    """Until it is interrupted."""
+    """Run the node until it is interrupted."""
     rclpy.init()
     node = DriftNode()
     try:

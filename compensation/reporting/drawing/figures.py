@@ -162,7 +162,7 @@ def make_curve(
 
 
 def make_dots(x: ArrayLike, y: ArrayLike, colour: str, label: str) -> Mark:
-    """Many single points, as a picture: the page does not grow with their number."""
+    """Draw many single points as a picture, so that the page does not grow with their number."""
     small = {"marker": "o", "linestyle": "", "markersize": 2, "markeredgewidth": 0}
     return make_curve(x, y, colour, label, alpha=0.5, rasterized=True, **small)
 
@@ -181,7 +181,7 @@ def make_span(begin: float, end: float, colour: str, label: str | None) -> Mark:
 
 
 def make_band(x: Float, reach: Float, label: str) -> Mark:
-    """From -reach to reach (M,) about 0."""
+    """Return a band from -reach to reach (M,) about 0."""
     return lambda axes: axes.fill_between(x, -reach, reach, color="#dddddd", linewidth=0, label=label)
 
 

@@ -90,7 +90,8 @@ def draw_uncertainty_map(calibration: CameraCalibration) -> Figure:
 
 
 def draw_rays_against_pinhole(calibration: CameraCalibration) -> Figure:
-    """Where the ray model sees what the pinhole sees at a pixel, at the mean distance; blank outside its markers."""
+    """Draw where the ray model sees what the pinhole sees at a pixel, at the mean distance; blank outside its
+    markers."""
     lens, rays = calibration.adjustment.scene.lens, calibration.rays
     pixels = make_pixel_grid(lens.image_size, 31)
     inside = pixels[rays.inside(pixels)]

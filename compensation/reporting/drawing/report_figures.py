@@ -55,7 +55,8 @@ TARGET_MOVED_ROLES = tuple(str(role) for role in (Role.CALIBRATION, Role.POSE, R
 
 
 def draw_warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack], titles: Sequence[str]) -> Figure:
-    """Mean drift since the first frame, and the camera's temperature, against the time since it was switched on."""
+    """Draw the mean drift since the first frame, and the camera's temperature, against the time since it was switched
+    on."""
     above, below = list[Panel](), list[Panel]()
     mean = "mean drift, " if len(curves) == 1 else ""
     for one, title in zip(curves, titles, strict=True):
@@ -73,8 +74,8 @@ def draw_warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack
 
 
 def draw_against_time(observations: Observations) -> Figure:
-    """Mean drift along I and J, and below it the temperatures, against the hours since the first frame; at the foot
-    those that a thermal imager saw, where there was one.
+    """Draw the mean drift along I and J, and below it the temperatures, against the hours since the first frame; at the
+    foot those that a thermal imager saw, if it saw any.
 
     Time between sessions is left out; a session begins at a dashed line. Frames of a target that was moved on purpose
     are not drift: they are a grey band.
@@ -154,7 +155,7 @@ def _group_equal(label: Rows) -> list[Rows]:
 def _mark_role_bands(
     hours: Float, observations: Observations, roles: tuple[str, ...], colour: str, label: str
 ) -> Iterator[Mark]:
-    """Behind each run of frames with these roles in a session."""
+    """Shade the background behind each run of frames with these roles in a session."""
     label_of_first: str | None = label
     run = np.where(np.isin(observations.role, roles), observations.session, -1)
     for frames in _group_equal(run):
@@ -166,7 +167,8 @@ def _mark_role_bands(
 def draw_branches(
     visits: Sequence[CycleVisit], before: Sequence[BranchDifference], after: Sequence[BranchDifference]
 ) -> Figure:
-    """Mean drift at each set-point on the way up and down, and below it the gap between the two, before and after."""
+    """Draw the mean drift at each set-point on the way up and down, and below it the gap between the two, before and
+    after."""
     labels = {"xlabel": "chamber temperature (°C)"}
     drift = {**labels, "ylabel": "mean drift (px)"}
     shown = [Panel([*_mark_branch(visits, index)], look=drift) for index in range(2)]

@@ -22,5 +22,5 @@ class Gradient(Term):
 
     @classmethod
     def usual(cls) -> Sequence[Term]:
-        """Those that every fit tries."""
+        """Return the terms that every fit tries."""
         return (cls(tau_s=700.0), cls(tau_s=2000.0))

@@ -154,8 +154,8 @@ class AravisCamera:
         return (Reading(channel, value_degC, "degC", time_ns),)
 
     async def describe_temperature_place(self) -> str:
-        """Which feature shows the temperature, and what the camera offers for its selector, in words; "" when none was
-        found: `read` then says why."""
+        """Return which feature shows the temperature, and what the camera offers for its selector, in words; "" when
+        none was found: `read` then says why."""
         return await self._call(self._require_connection().temperature_place)
 
     async def _grab_triggered(self, connection: Connection, exposure_s: float, due_ns: int) -> Shot:

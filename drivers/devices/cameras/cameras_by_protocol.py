@@ -93,7 +93,7 @@ def _advise(error: DeviceError, name: str, settings: CameraSettings) -> str:
 
 
 def check_packets(name: str, address: str, packet_size: int) -> Finding:
-    """Whether the network interface towards the camera takes its packets whole: larger ones are lost, or come in
+    """Return whether the network interface towards the camera takes its packets whole: larger ones are lost, or come in
     pieces that the camera does not send again."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as towards:
         try:
@@ -156,7 +156,7 @@ async def check_settings(camera: Camera, add: Add) -> None:
 
 
 async def _is_supplied(look: DeviceCheck) -> bool:
-    """Whether the camera is powered, as far as the relays show."""
+    """Return whether the camera is powered, as far as the relays show."""
     if "relays" not in look.opened:
         return True
     try:

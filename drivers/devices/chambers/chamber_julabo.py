@@ -107,7 +107,8 @@ class JulaboLanguage(ChamberLanguage):
         return self.client.query(b"version\r", parse_line)
 
     def state(self) -> ChamberState:
-        """Of the bath, and of its status: what that says of a command that it did not take is no alarm."""
+        """Read the state of the bath and of its status: what that says of a command that it did not take is no
+        alarm."""
         code, words = self._status()
         mode = self.client.query(b"in_mode_05\r", parse_line)
         if mode not in ("0", "1"):

@@ -107,7 +107,7 @@ class ClimateChamber:
             return self._readings(state)
 
     async def in_force(self) -> InForce:
-        """As `Controller`."""
+        """Return how it is known that the written set-point acts, as Controller.in_force states."""
         async with self._exclusive:
             state = await self._call(self._identify_and_read)
             return InForce(self._language.in_force_by, self._language.not_reported, state.objections)

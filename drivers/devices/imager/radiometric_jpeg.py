@@ -49,7 +49,7 @@ class RadiometricImage:
 
 
 def is_whole(data: bytes) -> bool:
-    """Whether a JPEG file has both its ends; a camera may fill up with zeros behind it."""
+    """Return whether a JPEG file has both its ends; a camera may fill up with zeros behind it."""
     return data.startswith(_START) and data.rstrip(b"\0").endswith(_END)
 
 

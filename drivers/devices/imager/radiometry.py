@@ -83,7 +83,8 @@ class RadiometricSurroundings:
 def compute_temperatures_degC(
     raw: NDArray[np.uint16], planck: Planck, around: RadiometricSurroundings, emissivity: float
 ) -> NDArray[np.float64]:
-    """Of a surface with this emissivity (0..1], in degC, shape of `raw`; NaN where the formula has no answer."""
+    """Compute the temperatures of a surface with this emissivity (0..1], in degC, shape of `raw`; NaN where the formula
+    has no answer."""
     tau, tw = around.air.transmission, around.window_transmission
     if not (tau > 0 and tw > 0 and emissivity > 0):
         return np.full(raw.shape, np.nan)

@@ -54,8 +54,8 @@ def _absolute(path: Path) -> Path:
 
 
 class SpotSettings(Document):
-    """Where one spot is: the middle of 3 x 3 px, counted from 0 at the top left, or the imager's own measurement spot
-    that is labelled `label`, where the picture has it. emissivity: of what is seen there."""
+    """The place of one spot: the middle of 3 x 3 px, counted from 0 at the top left, or the imager's own measurement
+    spot that is labelled `label`, where the picture has it. emissivity: of what is seen there."""
 
     x_px: int = Field(ge=0, le=4095)
     y_px: int = Field(ge=0, le=4095)
@@ -64,7 +64,7 @@ class SpotSettings(Document):
 
 
 def locate_spot(image: RadiometricImage, spot: SpotSettings) -> tuple[int, int]:
-    """Where a spot is in a picture, x and y in px."""
+    """Return where a spot is in a picture, x and y in px."""
     here = spot.x_px, spot.y_px
     return image.spots.get(spot.label, here) if spot.label else here
 

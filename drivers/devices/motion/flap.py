@@ -298,7 +298,7 @@ class Flap:
         )
 
     def _read_identity(self, device: _UsbDevice) -> Identity:
-        """Its serial number is what it was found by; the version is that of its firmware, binary coded decimal."""
+        """Read the serial number by which it was found, and the version of its firmware, binary coded decimal."""
         version = f"{device.bcdDevice >> 8:x}.{device.bcdDevice & 0xFF:02x}"
         model = f"Jrk G2 {_PRODUCTS_JRK_G2[device.idProduct]}"
         return Identity("Pololu", model, self._settings.serial_number, version)

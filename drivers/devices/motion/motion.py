@@ -34,7 +34,7 @@ class MotionArbiter:
         self._barred = False
 
     def take(self, aim: object = None, *, safe: bool = False) -> MotionCommand:
-        """From now on this command counts; one under way with the same aim continues along with it.
+        """Let this command count from now on; one under way with the same aim continues along with it.
 
         Superseded, before anything is sent, when the actuator was made safe and not allowed to move since.
         """

@@ -177,7 +177,7 @@ class Axis:
         )
 
     async def homed(self) -> bool:
-        """Whether the position scale is calibrated."""
+        """Return whether the position scale is calibrated."""
         return self._is_homed(await self._call(self._read_status))
 
     async def home(self) -> float:

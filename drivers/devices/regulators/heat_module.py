@@ -88,7 +88,7 @@ class HeatModule:
 
     @property
     def identity(self) -> Identity | None:
-        """Which module has answered; None before `open`."""
+        """The module that has answered; None before `open`."""
         return self._unit.identity
 
     async def open(self) -> None:
@@ -126,8 +126,8 @@ class HeatModule:
         )
 
     async def arm(self) -> None:
-        """Before control begins: safe values as configured, output at zero, watchdog on and not tripped, all read back.
-        A trip is cleared: the program that starts control has seen it."""
+        """Prepare it before control begins: safe values as configured, output at zero, watchdog on and not tripped, all
+        read back. A trip is cleared: the program that starts control has seen it."""
         async with self._exclusive:
             self._armed_ns, self._left_mA = None, None
             await self._prepare()
@@ -163,8 +163,8 @@ class HeatModule:
             self._armed_ns = self._clock.now_ns()
 
     async def off(self) -> None:
-        """No heat, confirmed; DeviceError. Its watchdog is off from then, unless it cannot be reached for that: then it
-        trips, which is as safe."""
+        """Stop all heat and confirm it; DeviceError when that fails. Its watchdog is off from then, unless it cannot be
+        reached for that: then it trips, which is as safe."""
         async with self._exclusive:
             await self._set_zero()
             self.uncontrolled = ""
@@ -174,8 +174,8 @@ class HeatModule:
             self._armed_ns = None
 
     async def test_dead_man(self) -> None:
-        """At zero: does the watchdog trip when the module is left alone, and not while it is written to? DeviceFault
-        when not: then it would heat on without us, or never for long."""
+        """Test at zero output whether the watchdog trips when the module is left alone, and not while it is written to.
+        DeviceFault when not: then it would heat on without us, or never for long."""
         await self.arm()
         try:
             await self._pause(_TESTED)
@@ -195,7 +195,7 @@ class HeatModule:
             await self.off()
 
     async def _verify_identity(self) -> None:
-        """That it is the module that answered before, or it gets no heat; off is never withheld."""
+        """Verify that it is the module that answered before, or it gets no heat; off is never withheld."""
         # Also after each loss of the line: a module that was exchanged in mid-run must not be heated with.
         if not self._exclusive.is_known:
             await self._unit.probe()

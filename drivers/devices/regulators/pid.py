@@ -66,7 +66,7 @@ def start(law: Law, measured_degC: float, output_percent: float) -> State:
 
 
 def continue_after_gap(law: Law, state: State, measured_degC: float) -> State:
-    """After a gap in the measurements: the integral as it was, and no kick by the derivative."""
+    """Return the state after a gap in the measurements: the integral as it was, and no kick by the derivative."""
     weighed_K = measured_degC - law.derivative_set_point_weight * state.set_point_degC
     return replace(state, derivative_percent=0.0, weighed_K=weighed_K)
 

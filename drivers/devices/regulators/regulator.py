@@ -68,7 +68,7 @@ class Regulator:
 
     @property
     def identity(self) -> Identity | None:
-        """Which unit has answered; None before `open`."""
+        """The unit that has answered; None before `open`."""
         return self._unit.identity
 
     async def open(self) -> None:
@@ -98,7 +98,7 @@ class Regulator:
             return readings
 
     async def in_force(self) -> InForce:
-        """As `Controller`."""
+        """Return how it is known that the written set-point acts, as Controller.in_force states."""
         async with self._exclusive:
             await self._ensure_started()
             known_by = "; ".join(map(str, self._map.in_force))

@@ -254,7 +254,8 @@ class SoftwareRegulator:
         )
 
     async def in_force(self) -> InForce:
-        """Nothing stands between the set-point and the law; what heats by it is read back by its own device."""
+        """Return that the set-point acts: nothing stands between it and the law; what heats by it is read back by its
+        own device."""
         return InForce("this program itself controls by it, and reads back the output that it gives")
 
     async def set_temperature(self, degC: float) -> None:
@@ -287,7 +288,7 @@ class SoftwareRegulator:
         await self.stop()
 
     async def test_dead_man(self) -> None:
-        """While it is stopped: does what it heats by end without us? DeviceFault when not."""
+        """Test, while it is stopped, whether what it heats by ends without us. DeviceFault when not."""
         await self._heat.test_dead_man()
 
     async def autotune(self) -> Law:

@@ -295,7 +295,7 @@ class FakeCamera:
             self._restart(self._clock.now_ns())
 
     def seize(self, on: bool) -> None:
-        """Another client is in control of it, until it is not."""
+        """Put another client in control of it, until it lets go."""
         with self._wake:
             self._channel.seize(on)
 
@@ -420,7 +420,7 @@ class FakeCamera:
             self._stream.sendto(bytes(size_bytes), destination)
 
     def _destination(self) -> Peer | None:
-        """Where the stream goes; None while the client has not opened its port."""
+        """Return where the stream goes; None while the client has not opened its port."""
         port = self._registers.integer("GevSCPHostPort")
         address = socket.inet_ntoa(self._registers.integer("GevSCDA").to_bytes(4, "big"))
         return (address, port) if port else None

@@ -92,8 +92,8 @@ class Registers:
                 self.put(feature.name, feature.default)
 
     def is_bootstrap(self, address: int, count: int) -> bool:
-        """Whether a bootstrap register lies there that says something; texts, such as the description's URL, are read
-        whole and not by 4 or 8 bytes."""
+        """Return whether a bootstrap register lies there that says something; texts, such as the description's URL, are
+        read whole and not by 4 or 8 bytes."""
         if count > _NUMBER_bytes:
             return address < BOOTSTRAP_bytes
         features = {at: fields[0].length for at, fields in self._at.items() if at < BOOTSTRAP_bytes}
@@ -128,7 +128,7 @@ class Registers:
         self._store(feature.address, word.to_bytes(feature.length, "big"))
 
     def covers(self, name: str, address: int, count: int) -> bool:
-        """Whether a read of `count` bytes at `address` touches the feature's register."""
+        """Return whether a read of `count` bytes at `address` touches the feature's register."""
         feature = self._table[name]
         return address < feature.address + feature.length and feature.address < address + count
 
@@ -248,7 +248,7 @@ class GvcpDevice(Protocol):
         ...
 
     def control_ended(self) -> None:
-        """No client is in control any more."""
+        """Note that no client is in control any more."""
         ...
 
 
@@ -289,7 +289,7 @@ class ControlChannel:
             self._release()
 
     def seize(self, on: bool) -> None:
-        """Another client takes control and keeps its heartbeat up, or lets go."""
+        """Let another client take control and keep its heartbeat up, or let go."""
         if self._controller is not None and (on or self._controller == _STRANGER):
             self._release()
         if on:

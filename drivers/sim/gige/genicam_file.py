@@ -146,7 +146,7 @@ def _unzip(data: bytes, path: Path) -> bytes:
 
 
 def _is_description(name: str) -> bool:
-    """Whether a name in an archive is an XML file's; what macOS adds to each file begins with a dot."""
+    """Return whether a name in an archive is an XML file's; what macOS adds to each file begins with a dot."""
     return name.lower().endswith(".xml") and not name.rpartition("/")[2].startswith(".")
 
 

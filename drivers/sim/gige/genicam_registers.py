@@ -55,7 +55,7 @@ class GenicamRegisters(Registers):
 
     @property
     def binning(self) -> tuple[int, int]:
-        """As the client has set it, 1 where the file knows none."""
+        """The binning as the client has set it, 1 where the file knows none."""
         across, down = (int(self._file.get(name)) if name in self._file.file else 1 for name in BINNING)
         return max(1, across), max(1, down)
 
@@ -96,7 +96,7 @@ class GenicamRegisters(Registers):
         super().put(name, value)
 
     def covers(self, name: str, address: int, count: int) -> bool:
-        """Whether a read of `count` bytes at `address` touches the feature's register."""
+        """Return whether a read of `count` bytes at `address` touches the feature's register."""
         if name != "DeviceTemperature":
             return super().covers(name, address, count)
         places = [self._file.place(register) for each in TEMPERATURES for register in self._registers_of(each)]
@@ -283,7 +283,7 @@ def _list_unsupported_features(camera: EvaluatedFile) -> Iterator[str]:
 
 
 def _is_raw_of_another(camera: EvaluatedFile, name: str) -> bool:
-    """Whether a feature is the raw one of another, which is set instead."""
+    """Return whether a feature is the raw one of another, which is set instead."""
     return name == "ExposureTimeRaw" and "ExposureTimeAbs" in camera.file
 
 
@@ -306,7 +306,7 @@ def _make_settable(camera: EvaluatedFile, name: str, value: float) -> bool:
 
 
 def _takes(camera: EvaluatedFile, name: str, value: float) -> bool:
-    """Whether twice the value and the value can be written, or none can."""
+    """Return whether twice the value and the value can be written, or none can."""
     try:
         camera.set(name, 2 * value)
         is_taken = _nearest(camera, name, 2 * value)
@@ -335,7 +335,7 @@ def _make_effective(camera: EvaluatedFile, command: str) -> bool:
 
 
 def _is_taken(camera: EvaluatedFile, node: str, value: float) -> bool:
-    """Whether a node shows what is written to it; its registers are then as before."""
+    """Return whether a node shows what is written to it; its registers are then as before."""
     before = {register: _get_value(camera, register) for register in camera.file.written(node)}
     _ignore_errors(camera.set, node, value)
     is_taken = _get_value(camera, node) == value
@@ -436,7 +436,7 @@ def _make_true(camera: EvaluatedFile, condition: str) -> None:
 
 
 def _list_conditions(camera: EvaluatedFile, names: Iterable[str]) -> Iterator[str]:
-    """Of everything a camera is used for, entries and limits included."""
+    """List the conditions of everything a camera is used for, entries and limits included."""
     file = camera.file
     for name in names:
         if name not in file:
@@ -453,7 +453,7 @@ def _with(camera: EvaluatedFile, register: str, raw: float, name: str) -> float 
 
 
 def _nearest(camera: EvaluatedFile, name: str, value: float) -> bool:
-    """Whether bisection came as near as a register's steps allow."""
+    """Return whether bisection came as near as a register's steps allow."""
     found = _get_value(camera, name)
     return found is not None and math.isclose(found, value, rel_tol=_NEAR_ENOUGH)
 

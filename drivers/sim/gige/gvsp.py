@@ -148,7 +148,7 @@ def encode_image(image: NDArray[np.uint8], pixel_format: PixelFormat) -> bytes:
 
 
 def _pack_in_three_bytes(values: NDArray[np.uint16], bits: int) -> bytes:
-    """Two pixels in three bytes: upper 8 bits, both lower parts (the first's in the lower half), upper 8 bits."""
+    """Pack two pixels in three bytes: upper 8 bits, both lower parts (the first's in the lower half), upper 8 bits."""
     low = bits - 8
     pairs = np.append(values, np.zeros(len(values) % 2, np.uint16)).reshape(-1, 2)
     shared = (pairs[:, 0] & (1 << low) - 1) | (pairs[:, 1] & (1 << low) - 1) << 4

@@ -42,7 +42,7 @@ class Switch:
         self._lock = threading.Lock()  # each camera sends in a thread of its own
 
     def passes(self, size_bytes: int, now_s: float | None = None) -> bool:
-        """Whether a packet of so many bytes of payload, which comes now, gets through."""
+        """Return whether a packet of so many bytes of payload, which comes now, gets through."""
         with self._lock:
             now_s = time.monotonic() if now_s is None else now_s
             left_bytes = self._held_bytes - (now_s - self._at_s) * self._rate_Bps
@@ -135,7 +135,7 @@ class _Queue:
         self.jobs = None
 
     def empty(self) -> bool:
-        """Nothing to send."""
+        """Return whether nothing waits to be sent."""
         return self.jobs is None and not self.resends and not self.refusals
 
     def take(self, budget_bytes: int) -> list[_Job]:

@@ -120,7 +120,7 @@ class FakeFlap:
 
     @property
     def unplugged(self) -> bool:
-        """No longer on the bus; plugged in again it has a new address and old handles stay dead."""
+        """Whether it is no longer on the bus; plugged in again it has a new address and old handles stay dead."""
         return self._unplugged
 
     @unplugged.setter

@@ -49,7 +49,7 @@ class Path:
 
     @property
     def duration_s(self) -> float:
-        """Time until rest, inf when it never comes."""
+        """The time until rest, inf when it never comes."""
         return sum(phase.duration_s for phase in self.phases)
 
     def at(self, elapsed_s: float) -> tuple[float, float]:
@@ -81,7 +81,7 @@ class Path:
         return highest
 
     def reaches_s(self, level: float, direction: int) -> float | None:
-        """When it first moves in `direction` (1 or -1) at or beyond `level`; None when it never does."""
+        """Return when it first moves in `direction` (1 or -1) at or beyond `level`; None when it never does."""
         begun_s = 0.0
         for phase in self.phases:
             if phase.direction() == direction:
@@ -150,7 +150,8 @@ def _join(first: Path, second: Path) -> Path:
 
 
 def _crossing_s(phase: MotionPhase, level: float, direction: int) -> float:
-    """Time within a phase moving in `direction` until it is at or beyond `level`; inf when the phase turns first."""
+    """Return the time within a phase moving in `direction` until it is at or beyond `level`; inf when the phase turns
+    first."""
     distance = direction * (level - phase.position)
     if distance <= 0:
         return 0.0

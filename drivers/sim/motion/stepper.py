@@ -48,7 +48,7 @@ class LimitSwitches:
         return RIGHT if self.right is not None and mechanical >= self.right - SWITCH_PLAY else 0
 
     def ahead(self, mechanical: float, direction: int) -> float:
-        """Where the switch of that side will close for a stage that leaves `mechanical`; infinite if nowhere."""
+        """Return where the switch of that side will close for a stage that leaves `mechanical`; infinite if nowhere."""
         if direction == RIGHT:
             return math.inf if self.right is None else self.right
         if self.turn_steps is None:
@@ -115,7 +115,7 @@ class Journey:
     rest_ns: int = 0
 
     def elapsed_s(self, time_ns: int) -> float:
-        """Time since it began, never negative."""
+        """Return the time since it began, never negative."""
         return max(0, time_ns - self.start_ns) / NS_PER_S
 
 
@@ -196,7 +196,7 @@ class Stepper:
         return travel.path.at(travel.elapsed_s(time_ns))[1]
 
     def mechanical(self, time_ns: int) -> float:
-        """Where the stage really is."""
+        """Return where the stage really is."""
         travel = self.travel(time_ns)
         return travel.path.at(travel.elapsed_s(time_ns))[0] + self._slip(travel, time_ns)
 

@@ -77,7 +77,7 @@ class Settings:
         return min(max(micro, 1 - self._division), self._division - 1)
 
     def stops(self) -> Stops:
-        """Where EDS lets the controller stop the motor: at the switches, at border values, or nowhere."""
+        """Return where EDS lets the controller stop the motor: at the switches, at border values, or nowhere."""
         flags, _, left, left_micro, right, right_micro = self._fields("eds")
         by_value = flags & table.BORDER_BY_VALUE
         left_stop = self.steps(left, left_micro) if by_value else None
@@ -237,7 +237,7 @@ class FakeAxis:
             return encode(frame.letters) if stored else self._error("errv", table.FLAG_ERRV)
 
     def power_cycle(self) -> None:
-        """Off and on again: settings from flash, count 0, not homed; the stage stays where it is."""
+        """Switch it off and on again: settings from flash, count 0, not homed; the stage stays where it is."""
         with self._plant.lock:
             now_ns = self._clock.now_ns()
             self._settings.restore()
@@ -527,7 +527,7 @@ class StageSpec(Document, extra="ignore"):
 
     @property
     def profile(self) -> table.Profile:
-        """As the two stages of this kind that are known, a switch at each end."""
+        """Return the profile of the two known stages of this kind, with a switch at each end."""
         stage = table.LINEAR_8MT160_300
         move, power, homing = (stage.settings[name] for name in ("mov", "pwr", "hom"))
         is_off = self.power_off_s is not None

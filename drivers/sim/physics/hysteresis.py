@@ -62,7 +62,7 @@ class Fixings:
 
     @property
     def place_px(self) -> tuple[float, float]:
-        """Where they are now."""
+        """Return where the fixings are now."""
         return self._place[0].value, self._place[1].value
 
     def step(self, travelled_K: float, dt_s: float) -> None:

@@ -86,7 +86,7 @@ _ALONE = ("heater_W", "compressor_W", "probe_lag_s", "near_lag_s")
 
 # The limits of the guard were chosen on ten chambers drawn so, and judged on others.
 def draw_chamber(seed: int, spread: float = 0.3) -> ChamberSpec:
-    """Another chamber of the kind: every conductance, every lag, the heater and the compressor drawn independently and
+    """Draw another chamber of the kind: every conductance, every lag, the heater and the compressor independently and
     evenly within +-`spread` of the standard one's. A heat capacity is its lag times its conductance."""
     draw = random.Random(f"chamber {seed}")
     standard = ChamberSpec()
@@ -148,7 +148,7 @@ class OwnPhysics(Protocol):
     """A camera whose temperatures are its own (published_camera.py)."""
 
     def optics(self, camera_roll_rad: float) -> CameraDeformation:
-        """Its parts' places at the last grid time."""
+        """Return the places of its parts at the last grid time."""
         ...
 
 

@@ -134,7 +134,7 @@ class PublishedCamera:
         return REFERENCE_degC + self._far_share * (self._far.value - REFERENCE_degC)
 
     def optics(self, camera_roll_rad: float) -> CameraDeformation:
-        """Its parts' places now."""
+        """Return the places of its parts now."""
         away_K = (self._degC - REFERENCE_degC).tolist()
         bent_K = [each * (1 + self._bend_per_K * each) for each in away_K]
         glass_share = 1 - self._cell_share

@@ -150,7 +150,7 @@ def compute_disc_coverages(
 
 
 def _boxes(outlines: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of outlines (n, points, 2) the smallest and the largest x and y, (n, 2) each."""
+    """Return the smallest and the largest x and y of outlines (n, points, 2), (n, 2) each."""
     x, y = np.ascontiguousarray(outlines[..., 0]), np.ascontiguousarray(outlines[..., 1])  # ten times as fast as pairs
     return np.stack((x.min(axis=1), y.min(axis=1)), axis=-1), np.stack((x.max(axis=1), y.max(axis=1)), axis=-1)
 

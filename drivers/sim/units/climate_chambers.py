@@ -62,11 +62,11 @@ class FakeClimateChamber:
         raise NotImplementedError
 
     def press_setpoint(self, setpoint_degC: float) -> None:
-        """Somebody changes it at the panel."""
+        """Change the set-point as an operator at the panel does."""
         self.setpoint_degC = setpoint_degC
 
     def press_stop(self) -> None:
-        """Somebody stops it at the panel."""
+        """Stop it as an operator at the panel does."""
         self.running = False
 
     def restart(self, running_at_degC: float | None = None) -> None:
@@ -76,7 +76,7 @@ class FakeClimateChamber:
 
     @property
     def acting_degC(self) -> float:
-        """Where it goes, whatever set-point was written."""
+        """Return where it goes, whatever set-point was written."""
         return self.setpoint_degC if self.program_degC is None else self.program_degC
 
     @property
@@ -325,7 +325,8 @@ class FakeJulabo(FakeClimateChamber):
 
     @property
     def acting_degC(self) -> float:
-        """Of the working temperature that is chosen; with a sensor outside the bath goes further than that."""
+        """Return where the chosen working temperature leads; with a sensor outside the bath it goes further than
+        that."""
         chosen_degC = (self.setpoint_degC, *self.others_degC)[self.bank]
         return chosen_degC + 20.0 if self.external else chosen_degC
 

@@ -100,13 +100,13 @@ class FakeHeatModule(BusUnit):
             return reply
 
     def power_cycle(self) -> None:
-        """Off and on again: power-on values, or the safe ones when the watchdog had tripped."""
+        """Switch it off and on again: power-on values, or the safe ones when the watchdog had tripped."""
         with self._now():
             self.values_mA = list(self.safe_mA if self.coils[TRIPPED] else self.power_on_mA)
             self._heard_ns = self._now_ns
 
     def write_mA(self, current_mA: float) -> None:
-        """Another master writes to the output."""
+        """Write to the output as another master does."""
         with self._now():
             self.values_mA[self._channel] = current_mA
 

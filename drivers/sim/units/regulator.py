@@ -240,7 +240,7 @@ def read_gains(ram: Mapping[int, float]) -> Gains:
 
 
 def find_stored_address(address: int) -> int:
-    """Where the value of an address is kept: SP0 is the set point."""
+    """Return where the value of an address is kept: SP0 is the set point."""
     return SETPOINT if address == SETPOINT_0 else address
 
 
@@ -288,12 +288,12 @@ class Constants(NamedTuple):
 
 
 def begin(error_K: float) -> Cycle:
-    """At a PV that is error_K above the set point."""
+    """Begin a cycle at a PV that is error_K above the set point."""
     return Cycle(heats=error_K < 0, extreme_K=error_K)
 
 
 def cycle_step(cycle: Cycle, error_K: float, time_s: float) -> Cycle:
-    """After a while at this PV - SP."""
+    """Advance the cycle after a while at this PV - SP."""
     extreme_K = (min if cycle.heats else max)(cycle.extreme_K, error_K)
     switches = error_K > HYSTERESIS_K if cycle.heats else error_K < -HYSTERESIS_K
     if not switches:
@@ -302,7 +302,7 @@ def cycle_step(cycle: Cycle, error_K: float, time_s: float) -> Cycle:
 
 
 def constants(cycle: Cycle, swing_percent: float) -> Constants:
-    """Of a cycle that is over, whose output went that far from one end to the other."""
+    """Compute the constants from a cycle that is over, whose output went that far from one end to the other."""
     period_s = (cycle.switched_s[-1] - cycle.switched_s[-5]) / 2
     amplitude_K = (max(cycle.extremes_K[-4:]) - min(cycle.extremes_K[-4:])) / 2
     effective_K = math.sqrt(max(amplitude_K**2 - HYSTERESIS_K**2, 1e-4))
@@ -530,23 +530,23 @@ class FakeRegulator(BusUnit):
     # On the front panel and at the mains.
 
     def power_cycle(self) -> None:
-        """Off and on again: RAM values, RAM mode and communications writing are gone, and it is stopped."""
+        """Switch it off and on again: RAM values, RAM mode and communications writing are gone, and it is stopped."""
         with self._now():
             self._power_up()
 
     def press_stop(self) -> None:
-        """Somebody stops control with the keys."""
+        """Stop control as with the keys."""
         with self._now():
             self._stop()
 
     def press_manual(self, heat_pct: float) -> None:
-        """Somebody takes over with the keys and dials in a heating output, %."""
+        """Take over as with the keys, and dial in a heating output, %."""
         with self._now():
             self._modes.add(Mode.MANUAL)
             self.outputs = Outputs(heat_pct, 0.0)
 
     def press_autotune(self, on: bool) -> None:
-        """Somebody starts autotuning (100 %) with the keys, or cancels it; a unit that is stopped declines."""
+        """Start autotuning (100 %) as with the keys, or cancel it; a unit that is stopped declines."""
         with self._now():
             if not on:
                 self._modes.discard(Mode.TUNING)
@@ -554,12 +554,12 @@ class FakeRegulator(BusUnit):
                 self._tune(1.0)
 
     def press_automatic(self) -> None:
-        """Somebody gives control back with the keys."""
+        """Give control back as with the keys."""
         with self._now():
             self._automatic()
 
     def press_setpoint(self, setpoint_degC: float) -> None:
-        """Somebody changes the set point with the keys; that is kept in EEPROM."""
+        """Change the set point as with the keys; that is kept in EEPROM."""
         with self._now():
             self._store(SETPOINT, setpoint_degC, keep=True)
 
@@ -617,7 +617,7 @@ class FakeRegulator(BusUnit):
         return _split_signed(upper if cycle.heats else lower)
 
     def _target_degC(self) -> float:
-        """Where it goes: the internal set point."""
+        """Return where it goes: the internal set point."""
         wanted_degC = self._ram[SETPOINT] if self.acting_degC is None else self.acting_degC
         if self.ramp_K_per_min is None or Mode.STOP in self._modes:
             return wanted_degC
@@ -645,7 +645,7 @@ class FakeRegulator(BusUnit):
         return to_ns(SHORT_PERIODS_S.get(int(coded), coded))
 
     def _conducts(self, output_pct: float, period_address: int) -> bool:
-        """Whether a time-proportioned output is on at the instant of the request."""
+        """Return whether a time-proportioned output is on at the instant of the request."""
         return on_time_ns(self._now_ns, self._now_ns + 1, output_pct / 100, self._period_ns(period_address)) > 0
 
 

@@ -43,7 +43,7 @@ class Relay:
     until_ns: int | None = None
 
     def closed_at(self, time_ns: int) -> bool:
-        """Whether the contact is closed at a time after the command."""
+        """Return whether the contact is closed at a time after the command."""
         return self.closed if self.until_ns is None or time_ns < self.until_ns else not self.closed
 
     def closed_share(self, time_ns: int, dt_ns: int) -> float:
@@ -93,13 +93,13 @@ class FakeRelays(BusUnit):
         plant.on_step.append(self._on_step)
 
     def power_cycle(self) -> None:
-        """Off and on again: every relay is open."""
+        """Switch it off and on again: every relay is open."""
         with self._now():
             self._relays = [Relay()] * RELAYS
             self._switch(self._now_ns)
 
     def closed(self, channel: str) -> bool:
-        """Whether the contact of that name conducts now, which a welded one always does."""
+        """Return whether the contact of that name conducts now, which a welded one always does."""
         with self._now():
             return self._conducts(channel, self._now_ns)
 
@@ -192,7 +192,7 @@ def _build(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeRelays:
 
 @fake("inputs", rank=CONTACTS)
 def _build_inputs(bench: Bench, name: str, settings: Mapping[str, Any]) -> FakeRelays:
-    """Those of the relay board, or of a board of its own. Contacts that are well while closed begin so."""
+    """Build the inputs of the relay board, or of a board of its own. Contacts that are well while closed begin so."""
     board = bench.fakes.get("relays")
     if not isinstance(board, FakeRelays) or board.unit != settings["unit"]:
         board = FakeRelays(bench.plant, bench.clock, settings["unit"], {})

@@ -191,13 +191,13 @@ def choose_next_action(state: RunState, around: Surroundings) -> Action | None:
 
 
 def has_all_frames(state: RunState, planned: PlannedStep) -> bool:
-    """Whether all frames of the capture were taken."""
+    """Return whether all frames of the capture were taken."""
     return isinstance(planned.step, Capture) and state.frames.get(planned.step_id, 0) >= planned.step.frames
 
 
 def needs_retake(state: RunState, around: Surroundings, planned: PlannedStep) -> bool:
-    """Whether the capture, which has all its frames, is taken again because the disk has lost some; not one of a camera
-    that has warmed up meanwhile."""
+    """Return whether the capture, which has all its frames, is taken again because the disk has lost some; not one of a
+    camera that has warmed up meanwhile."""
     if not around.frames_lost or not isinstance(planned.step, Capture) or planned.step.role is Role.WARM_UP:
         return False
     has_tries = state.retakes.get(planned.step_id, 0) < MOST_RETAKES_FOR_LOST_FRAMES
@@ -238,8 +238,8 @@ def _choose_capture_action(state: RunState, around: Surroundings, planned: Plann
 
 
 def compute_next_due_ns(due_ns: int | None, capture: Capture, around: Surroundings, *, is_lost: bool) -> int:
-    """When the next frame is due after the capture was made ready, on a grid of absolute deadlines: those missed while
-    the run was held or a lost camera reopened are skipped, not made up for by a burst."""
+    """Return when the next frame is due after the capture was made ready, on a grid of absolute deadlines: those missed
+    while the run was held or a lost camera reopened are skipped, not caught up."""
     if due_ns is None:
         return around.now_ns + around.lead_ns
     interval_ns = to_ns(capture.interval_s)
@@ -247,8 +247,8 @@ def compute_next_due_ns(due_ns: int | None, capture: Capture, around: Surroundin
 
 
 def compute_due_after_ns(due_ns: int, capture: Capture, now_ns: int) -> int:
-    """When the next frame is due after one: at the latest deadline that has passed, for a free-running camera gives its
-    frame up to a period late."""
+    """Return when the next frame is due after one: at the latest deadline that has passed, for a free-running camera
+    gives its frame up to a period late."""
     interval_ns = to_ns(capture.interval_s)
     return due_ns + max(1, (now_ns - due_ns) // interval_ns) * interval_ns
 

@@ -130,7 +130,7 @@ def compute_settled_offsets(session: Session) -> dict[float, float]:
 
 
 def _is_steady(camera_degC: Sequence[float] | NDArray[np.float64]) -> bool:
-    """Whether the camera has settled, by what it read within the window."""
+    """Return whether the camera has settled, by what it read within the window."""
     middle = len(camera_degC) // 2
     return middle > 0 and abs(float(np.mean(camera_degC[middle:]) - np.mean(camera_degC[:middle]))) <= _STEADY_K
 

@@ -233,7 +233,7 @@ async def restore_set_up(
 
 
 def raise_unguarded(error: DeviceError) -> None:
-    """Where no guard holds a run, a device error ends it."""
+    """Raise a device error, which ends a run that no guard holds."""
     raise error
 
 
@@ -348,7 +348,7 @@ class Executor:
             raise
 
     async def _try(self, action: Action) -> bool:
-        """Whether the action came to its end; not so when something has undone the set-up meanwhile."""
+        """Return whether the action came to its end; not so when something has undone the set-up meanwhile."""
         state = self._state
         is_readying = isinstance(action, PreparingAction) or (
             isinstance(action, ContinueSoak) and action.soak.step_id != state.plan[state.index].step_id
@@ -423,7 +423,7 @@ class Executor:
                 pass
 
     async def _restart_steps(self, again: Plan, how: str, frames_lost: int = 0) -> None:
-        """These steps count as neither begun nor done, and no frame of theirs so far: reported before it is journaled,
+        """Count these steps as neither begun nor done, and no frame of theirs so far: reported before it is journaled,
         so that no frame is ever left out unreported."""
         now_ns, step_ids = self._clock.now_ns(), [planned.step_id for planned in again]
         frames = self._state.frames.get(step_ids[-1], 0)

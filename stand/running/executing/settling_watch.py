@@ -87,15 +87,15 @@ class SettlingWatch:
         return 0.0 if since == time_s.size else now_s - float(time_s[since])
 
     def outside_degC(self, chamber_degC: float, band_K: float) -> float | None:
-        """Where the chamber is when that is outside the band around its set-point; None when it is inside, or is not
-        known (a frame then has no temperature of it either)."""
+        """The chamber's temperature when that is outside the band around its set-point; None when it is inside, or is
+        not known (a frame then has no temperature of it either)."""
         chamber = self._readings[CHAMBER]
         if not chamber or to_seconds(self._clock.now_ns()) - chamber[-2] > _UNKNOWN_S:
             return None
         return chamber[-1] if abs(chamber[-1] - chamber_degC) > band_K else None
 
     async def is_settled(self, soak: SoakUntilSettled, step_id: str, soaked_s: float) -> bool:
-        """Whether the soak, `soaked_s` old, may end now; says so, and also when it has to end without.
+        """Return whether the soak, `soaked_s` old, may end now; says so, and also when it has to end without.
 
         Looks are taken every `soak.look_every_s` from when the chamber is in its band; judged is after each of them.
         """
@@ -112,7 +112,7 @@ class SettlingWatch:
         return False
 
     async def _take_look(self, soak: SoakUntilSettled, step_id: str) -> bool:
-        """Whether a look was due and has shown the target."""
+        """Return whether a look was due and has shown the target."""
         now_ns, every_ns = self._clock.now_ns(), to_ns(soak.look_every_s)
         if self._due_ns is None and self._has_arrived(soak.chamber_degC):
             self._due_ns = now_ns

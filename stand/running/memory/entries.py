@@ -176,7 +176,7 @@ class Due:
 
 @dataclass(frozen=True, slots=True)
 class Readying:
-    """From now on (`begins`) or until now the stand is being made ready."""
+    """The stand is being made ready from now on (`begins`) or was until now."""
 
     time_ns: int
     begins: bool

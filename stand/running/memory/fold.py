@@ -169,7 +169,7 @@ def _extend(planned: PlannedStep, step_id: str, by_s: float) -> PlannedStep:
 
 
 def _advance_index(state: RunState) -> RunState:
-    """From its place on: the first step to do, and what those before it have set up."""
+    """Advance the index from its place on: to the first step to do, with what those before it have set up."""
     index, set_up = state.index, state.set_up
     while index < len(state.plan) and (planned := state.plan[index]).step_id in state.done:
         set_up = set_up if planned.step_id in state.skipped else set_up.after(planned)
@@ -241,7 +241,8 @@ def _count_outage(state: RunState, time_ns: int, reasons: frozenset[str], *, rea
 
 
 def _apply_gap(state: RunState, entry: Gap) -> RunState:
-    """Another daemon resumes the run: nothing holds it yet, nothing is under way, and the stand's state is unknown."""
+    """Apply that another daemon resumes the run: nothing holds it yet, nothing is under way, and the stand's state is
+    unknown."""
     return replace(
         state,
         under_way="",

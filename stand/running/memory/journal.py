@@ -115,8 +115,8 @@ class Journal:
         return cls(path, fd, data, mark, damage), entries
 
     def start(self, clock: Clock, trouble: Callable[[str], None], disk: DiskProcess | None = None) -> None:
-        """Before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence, `disk` is the
-        process that has the file from then on."""
+        """Start it before the first `write`: `clock` is held while the disk works, `trouble` takes a sentence, `disk`
+        is the process that has the file from then on."""
         self._worker = WorkerThread("journal", clock, patient=False)
         self._trouble = trouble
         self._disk = disk
@@ -157,7 +157,8 @@ class Journal:
         self._failing = failure is not None
 
     async def recover(self) -> bool:
-        """Whether the file is at its place; else the whole file is rewritten there. OSError when the disk refuses."""
+        """Return whether the file is at its place; else the whole file is rewritten there. OSError when the disk
+        refuses."""
         if self._worker is None:
             return True
         is_back = await self._worker.call(self._refound)
@@ -188,7 +189,7 @@ class Journal:
             self._file.close()
 
     def _commit(self) -> OSError | None:
-        """In the worker thread, put what waits on the disk; on OSError the file is as it was."""
+        """Put what waits on the disk, in the worker thread; on OSError the file is as it was."""
         count = len(self._waiting)
         if not count:
             return None
@@ -277,7 +278,7 @@ class JournalFile:
         self._size_bytes += len(data)
 
     def refound(self, data: bytes) -> bool:
-        """Whether the file is at its place again; else one with all the lines, `data`, is made there."""
+        """Return whether the file is at its place again; else one with all the lines, `data`, is made there."""
         if self._is_in_place():
             return True
         part = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
@@ -359,11 +360,11 @@ class Logbook:
         await journal.close()
 
     def enter(self, entry: Entry) -> None:
-        """Into the state alone: what the recording proves, or the next gap makes void."""
+        """Enter into the state alone what the recording proves, or the next gap makes void."""
         self.state = apply_entry(self.state, entry)
 
     async def write(self, *entries: JournalEntry) -> None:
-        """Into the state at once; on the disk when this returns, or kept for the next time."""
+        """Enter it into the state at once; it is on the disk when this returns, or kept for the next time."""
         for entry in entries:
             self.enter(entry)
         if self._journal is not None:

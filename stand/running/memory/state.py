@@ -173,7 +173,7 @@ class RunState:
     ended: Ended | None = None
 
     def is_decided(self, step_id: str) -> bool:
-        """Whether the decision of that step was made; it is not made again."""
+        """Return whether the decision of that step was made; it is not made again."""
         return any(isinstance(change, Edited) and change.decided == step_id for change in self.changes)
 
     @property

@@ -25,7 +25,8 @@ _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be wo
 
 
 async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
-    """Until cancelled. Events: `flap_shut_in_hold` and, when it does not close, `flap_not_shut` (an error)."""
+    """Keep the flap shut in each hold, until cancelled. Events: `flap_shut_in_hold` and, when it does not close,
+    `flap_not_shut` (an error)."""
     while True:
         await stand.gate.wait_until_closed()
         if await _opens_within(stand.gate, clock, SHUT_AFTER_S):
@@ -42,7 +43,7 @@ async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
 
 
 async def _shut_flap(stand: Stand, hub: Hub, clock: Clock) -> bool:
-    """Whether it is shut now."""
+    """Return whether it is shut now."""
     reasons = sorted(stand.gate.reasons)
     try:
         await stand.imaging.close_flap()
@@ -54,13 +55,13 @@ async def _shut_flap(stand: Stand, hub: Hub, clock: Clock) -> bool:
 
 
 async def _opens_within(gate: Gate, clock: Clock, duration_s: float) -> bool:
-    """Whether the gate opens before so long is over."""
+    """Return whether the gate opens before so long is over."""
     return await wait_for_first(gate.wait_until_open(), clock.sleep_until(clock.now_ns() + to_ns(duration_s))) == 0
 
 
 async def end_endless_holds(gate: Gate, hub: Hub, clock: Clock, latch: Latch, limit_h: float) -> None:
-    """For virtual time, until cancelled. NotReset when what is latched needs an operator and no command came for
-    30 min, StandError when the gate has been closed for `limit_h` without interruption."""
+    """End holds for virtual time, until cancelled. NotReset when what is latched needs an operator and no command came
+    for 30 min, StandError when the gate has been closed for `limit_h` without interruption."""
     since_ns: int | None = None  # the gate has been closed
     waits_ns: int | None = None  # the hold has waited for an operator
 

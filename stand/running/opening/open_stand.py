@@ -39,7 +39,7 @@ Result = TypeVar("Result")
 
 
 class RunRecorder(Recording, Protocol):
-    """Of what is recorded now, by a run or between runs."""
+    """The recorder of what is recorded now, by a run or between runs."""
 
     def recover_folder(self) -> None:
         """An operator has reset the loss of its folder."""
@@ -89,7 +89,7 @@ class OpenStand:
 
     @property
     def guard(self) -> Guard:
-        """There is one after `prepare`."""
+        """The guard, which exists after `prepare`."""
         if self._guard is None:
             raise ValueError("a stand is guarded when it is prepared")
         return self._guard
@@ -103,7 +103,7 @@ class OpenStand:
         return "" if self._guard is None else self._guard.describe_remaining_faults()
 
     def is_well(self) -> bool:
-        """Whether the guard looks as often as it must, and finds nothing."""
+        """Return whether the guard looks as often as it must, and finds nothing."""
         return self._guard is not None and self._guard.is_on_time and self.latch.fault is None
 
     @property
@@ -218,7 +218,7 @@ class OpenStand:
             self.guest.hold(fault)
 
     def _frames_are_due(self) -> bool:
-        """Whether frames are due from the camera, which is powered."""
+        """Return whether frames are due from the camera, which is powered."""
         return self.assembly.stand.imaging.supply.is_on and self.guest is not None and self.guest.frames_to_come
 
     def _release(self) -> None:
@@ -311,7 +311,7 @@ async def _open_devices(assembly: Assembly, *, is_for_one: bool) -> None:
 
 
 async def make_safe(assembly: Assembly, stop: Stop) -> tuple[str, ...]:
-    """At the end of a stand without a guard: all that may have moved is safe, confirmed; what has not confirmed it
+    """Make safe, at the end of a stand without a guard, all that may have moved, and return what has not confirmed it
     within guard.safe_limit_s."""
     stop.begin_takedown()
     await stop.wait_until_aborted()

@@ -48,7 +48,7 @@ class LockAddress(NamedTuple):
 
 
 def list_addresses(config: StandConfig) -> tuple[LockAddress, ...]:
-    """Where a run of this stand reads and switches: the bus, and each device by its kind.
+    """List where a run of this stand reads and switches: the bus, and each device by its kind.
 
     Real flaps, cameras and stages count by their serial numbers, too: behind another address they are the same ones. Of
     a simulated laboratory there may be several, with the same numbers. Asks the name service, and so may take a while.
@@ -174,13 +174,14 @@ def _make_in_use(device: str, place: str) -> InUse:
 
 
 def make_file_name(place: str, suffix: str = ".lock") -> str:
-    """To be read by people, and one of its own for each place."""
+    """Make a file name that people can read, and that is one of its own for each place."""
     digest = hashlib.sha256(place.encode()).hexdigest()[:8]
     return f"{re.sub(r'[^A-Za-z0-9._]+', '-', place)[:80]}-{digest}{suffix}"
 
 
 def _describe_holder(file_name: str) -> str:
-    """Who has the lock, as words of the sentence; a process that is just taking it writes its name a moment later."""
+    """Describe who has the lock, as words of the sentence; a process that is just taking it writes its name a moment
+    later."""
     for _ in range(_HOLDER_TRIES):
         for folder in (*list_runtime_folders(), STANDS_FOLDER):
             with suppress(OSError, ValueError, LookupError, TypeError):
@@ -210,7 +211,7 @@ def _read_lock(path: Path) -> dict[str, object]:
 
 
 def _describe_lock(path: Path) -> str:
-    """Who has it, in words; raises as `_said`."""
+    """Describe in words who has it; raises as `_said`."""
     text = _read_lock(path)
     daemon = f"`{text['command']}`" if text.get("command") else "the daemon of `stand serve`"
     who = f"session {text['session']}" if text["session"] else daemon

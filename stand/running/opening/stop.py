@@ -65,7 +65,7 @@ class Stop:
         self._begin_stop(fault)
 
     def _begin_stop(self, fault: Fault) -> bool:
-        """Nothing moves from now on; whether this stop is the first."""
+        """Let nothing move from now on, and return whether this stop is the first."""
         self.reason = self.reason or fault
         if self._stand is not None:
             self._stand.gate.hold(STOPPING)  # nothing earns time while the stand is being made safe
@@ -87,7 +87,7 @@ class Stop:
         self._turn(PhaseTurn.TAKE_DOWN)
 
     async def wait_until_aborted(self) -> None:
-        """From here on nothing is cancelled: the clock and the wires may go."""
+        """Wait until the run is aborted; from then on nothing is cancelled: the clock and the wires may go."""
         self._turn(PhaseTurn.TAKE_DOWN)
         if self._aborting is not None:
             await asyncio.wait([self._aborting])

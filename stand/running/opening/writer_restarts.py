@@ -20,7 +20,7 @@ class WriterRestarts:
         self._restarted_ns: deque[int] = deque()
 
     def may_follow(self, fault: Fault | None, now_ns: int) -> bool:
-        """Whether a run that this fault has ended is resumed now; then it counts as resumed."""
+        """Return whether a run that this fault has ended is resumed now; then it counts as resumed."""
         while self._restarted_ns and now_ns - self._restarted_ns[0] >= 3600 * NS_PER_S:
             self._restarted_ns.popleft()
         if fault is None or fault.rule != RECORDING_ENDED or len(self._restarted_ns) >= MOST_PER_H:

@@ -49,7 +49,7 @@ class TokenStore:
         self._watchers.append((asyncio.get_running_loop(), call))
 
     def renew(self, known: TokenFile) -> None:
-        """These from now on."""
+        """Use these tokens from now on."""
         self.known = known
         for loop, call in self._watchers:
             with suppress(RuntimeError):  # it has ended
@@ -151,7 +151,7 @@ class Access:
         return cookie
 
     def identify(self, scope: Scope) -> Who | None:
-        """Who asks; None when that has to be proved and is not. Denied when what is given as proof is none."""
+        """Return who asks; None when that has to be proved and is not. Denied when what is given as proof is none."""
         state, headers = cast("dict[str, Any]", scope.get("state") or {}), cast("Headers", scope["headers"])
         if state.get("door") == "socket":
             return Who(name=get_user_name(state.get("uid")), how="socket")
@@ -222,7 +222,7 @@ class Access:
         return time.monotonic() < login.until_s and login.of in (None, self._find_token(login.who.name))
 
     def _find_token(self, name: str) -> tuple[str, bool] | None:
-        """That of a name, and whether it is read-only."""
+        """Return the token of a name, and whether it is read-only."""
         return (self.tokens.known or TokenFile()).list_by_name().get(name)
 
 
@@ -247,7 +247,7 @@ def get_peer_uid(connection: socket.socket) -> int | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to listen at is of this machine only."""
+    """Return whether an address to listen at is of this machine only."""
     if host == "localhost":
         return True
     try:
@@ -317,8 +317,8 @@ def is_exempt_from_token(path: str) -> bool:
 
 
 class Gatekeeper:
-    """Before an ASGI application: checks, limits, and the headers of every answer. `failed` is called with what the
-    application raises, which is answered with 500."""
+    """A gatekeeper before an ASGI application: checks, limits, and the headers of every answer. `failed` is called with
+    what the application raises, which is answered with 500."""
 
     def __init__(self, app: App, access: Access, failed: Callable[[Exception], None]) -> None:
         self._app = app

@@ -250,7 +250,7 @@ class Bridge:
 
 
 def make_no_answer(limit_s: float) -> NoAnswer:
-    """That of a control loop which has taken longer."""
+    """Make the answer for a control loop that has taken longer."""
     return NoAnswer(f"the stand has not answered within {limit_s:g} s; it may still do what was asked")
 
 

@@ -58,7 +58,8 @@ class _Viewer(WebSocketsSansIOProtocol):
     _has_asked = False
 
     def data_received(self, data: bytes) -> None:
-        """As ever, within the budget; the first is the request, and until it is answered there is nothing to say."""
+        """Take data within the budget; the first is the request, and until it is answered the client has nothing to
+        say."""
         now_s = self.loop.time()
         if not self._has_asked:
             self._has_asked, self._budget_bytes = True, float(_VIEWER_BURST_BYTES)

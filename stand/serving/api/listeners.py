@@ -45,7 +45,7 @@ class Interface:
 
     @property
     def url(self) -> str:
-        """Where it is reached over the network, "" when it is not."""
+        """The address at which it is reached over the network, "" when it is not."""
         if self.port is None:
             return ""
         name = socket.gethostname() if self.host in ("0.0.0.0", "::", "") else self.host

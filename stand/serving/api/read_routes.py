@@ -157,7 +157,7 @@ def make_read_routes(bridge: Bridge, stream: Stream, access: Access, url: str) -
 
     @router.get("/healthz", response_model=Health, responses={503: {"model": Health}})
     async def healthz() -> Response:
-        """Whether the control loop is alive: 200, else 503."""
+        """Return whether the control loop is alive: 200, else 503."""
         age_s = bridge.snapshot.age_s
         health = Health(ok=age_s < _OLD_S, age_s=round(age_s, 3), error="" if age_s < _OLD_S else _explain_age(bridge))
         return _make_response(health.model_dump_json(), 200 if health.ok else 503)

@@ -61,7 +61,7 @@ class DiskReader:
         self._lock = asyncio.Lock()
 
     async def ask(self, question: Callable[[], Result]) -> Result:
-        """Its answer, or what it raises; NoAnswer when the disk does not give it in time."""
+        """Return the disk's answer, or raise what it raises; NoAnswer when the disk does not give it in time."""
         answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
 
         def ask_it() -> None:

@@ -57,7 +57,7 @@ _CHUNKED = re.compile(rb"\n[Tt][Rr][Aa][Nn][Ss][Ff][Ee][Rr]-[Ee][Nn][Cc][Oo][Dd]
 
 
 def is_readable(listening: socket.socket) -> bool:
-    """Whether somebody waits there: without a descriptor the kernel refuses also when nobody does."""
+    """Return whether somebody waits there: without a descriptor the kernel refuses also when nobody does."""
     poll = select.poll()  # select.select takes no descriptor above 1023
     poll.register(listening, select.POLLIN)
     return bool(poll.poll(0))
@@ -78,12 +78,12 @@ class _Client:
         self.has_answer = False
 
     def may_leave(self, now_s: float) -> bool:
-        """Whether it makes way for another; a STOP arrives as a whole, except from clients that drip."""
+        """Return whether it makes way for another; a STOP arrives as a whole, except from clients that drip."""
         has_time = not self.has_spoken and now_s < self.came_s + _MAY_SPEAK_S
         return self.has_answer or not (self.answer is not None or self.waits or has_time)
 
     def make_scope(self, request: h11.Request) -> Scope:
-        """Its request, as the gatekeeper gets it."""
+        """Make the scope of the client's request, as the gatekeeper gets it."""
         is_local = self.connection.family == socket.AF_UNIX
         remote, here = (None, None) if is_local else (self.connection.getpeername(), self.connection.getsockname())
         return {
@@ -101,9 +101,9 @@ class _Client:
 
 
 class StopThread:
-    """From `start` to `end`; `listen`, `start` and `end` are for any thread. hand_over: is given who wants something
-    else, and returns whether there is a place. `stopping` as that of the bridge; `failed` is called with what should
-    not happen."""
+    """The thread that accepts connections, from `start` to `end`; `listen`, `start` and `end` are for any thread.
+    hand_over: is given who wants something else, and returns whether there is a place. `stopping` as that of the
+    bridge; `failed` is called with what should not happen."""
 
     def __init__(self, stopping: Stopping, access: Access, failed: Callable[[Exception], None]) -> None:
         self.hand_over: Callable[[ListenerKind, socket.socket], bool] = lambda _door, _connection: False
@@ -238,7 +238,7 @@ class StopThread:
         return excess <= 0
 
     def _free_descriptor(self) -> bool:
-        """Whether there is a descriptor now, which there was not."""
+        """Return whether there is a descriptor now, which there was not."""
         silent = [each for each in self._clients.values() if each.answer is None or each.has_answer]
         if silent:
             with suppress(OSError):
