@@ -104,7 +104,7 @@ def states(
 def build_history(
     air: Column, supply: Column | None, camera: Column | None, time_ns: NDArray[np.int64], camera_degC: Float
 ) -> ThermalHistory:
-    """What lags are computed from; ValueError when a column is none. A camera without `supply` is on, for it has
+    """Return what lags are computed from; ValueError when a column is none. A camera without `supply` is on, for it has
     temperatures, and without `camera` what it read at the frames is all that is known of its own."""
     frames = time_ns, camera_degC
     powered = (np.empty(0, np.int64), np.empty(0)) if supply is None else _check_column("supply", supply)
@@ -425,8 +425,8 @@ def _list_unknown(is_unknown: Mapping[str, bool], sigma_px: float) -> dict[str, 
 
 
 def _check_covariance(covariance_px2: ArrayLike | None, sigma_px: float, missing: NDArray[np.bool_]) -> Float:
-    """What is given, else that of coordinates with this uncertainty each, for all of (F, N, 2, 2); ValueError when it
-    is no covariance of a centre that is there."""
+    """Return what is given, else that of coordinates with this uncertainty each, for all of (F, N, 2, 2); ValueError
+    when it is no covariance of a centre that is there."""
     if covariance_px2 is None:
         if not sigma_px > 0:
             raise ValueError(f"sigma_px is {sigma_px}; expected one above 0")

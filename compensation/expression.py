@@ -74,7 +74,7 @@ class Origin:
         return Expression((feature[0], *map(self.bind, feature[1:]))) if feature not in INPUTS else feature
 
     def evaluate_at_rest(self, feature: Any) -> float:
-        """What a feature without `away` is in equilibrium at the reference, of a camera that is on."""
+        """Return what a feature without `away` is in equilibrium at the reference, of a camera that is on."""
         if isinstance(feature, tuple) and feature[0] in ("lag", "play"):
             return self.evaluate_at_rest(feature[1])
         if not isinstance(feature, tuple) or feature in INPUTS:

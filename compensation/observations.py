@@ -329,7 +329,7 @@ def _build_observations(session: Session, target: Target, found: FoundMarkers, f
 def _explain_unusable(
     found: FoundMarkers, first: int, camera_degC: Float, superseded: NDArray[np.bool_], flags: NDArray[np.str_]
 ) -> tuple[str, ...]:
-    """Why each frame cannot be used, "" when it can."""
+    """Return why each frame cannot be used, "" when it can."""
     width, height = found.size_px[first].tolist()
     columns = (found.size_px.tolist(), found.reason.tolist(), camera_degC.tolist(), superseded.tolist(), flags.tolist())
     reasons: list[str] = []

@@ -116,8 +116,8 @@ class Identity:
 
 
 def check_same_device(device: str, found: Identity, before: Identity | None) -> Identity:
-    """What has answered; DeviceFault, which names both, when another one answered before: it was exchanged, and nothing
-    is known of the new one."""
+    """Return what has answered; DeviceFault, which names both, when another one answered before: it was exchanged, and
+    nothing is known of the new one."""
     if before is not None and found.is_another_than(before):
         raise DeviceFault(
             device, f"was exchanged: {found} answers where {before} answered before; not used until a new start"

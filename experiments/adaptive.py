@@ -81,12 +81,12 @@ def begin_cycle(
 
 
 def plan_fixed_visits(decide: Decide) -> tuple[Step, ...]:
-    """What follows a `Decide` in the plan: the visits that are made when nothing is decided."""
+    """Return what follows a `Decide` in the plan: the visits that are made when nothing is decided."""
     return tuple(step for degC in decide.set_points_degC for step in _plan_visit(decide, degC, decide.soak_s))
 
 
 def apply_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
-    """What follows that `Decide` instead of `plan_fixed_visits`."""
+    """Return what follows that `Decide` instead of `plan_fixed_visits`."""
     match answer:
         case Enough():
             return _plan_validations(decide, decide.unvalidated_degC)

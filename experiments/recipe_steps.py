@@ -103,8 +103,8 @@ def describe_unknown(what: str, name: str, known: Iterable[str]) -> str:
 
 @cache
 def _make_entry_model(step: type[Step]) -> type[Document]:
-    """What an entry of that kind is: one field, by the kind's name. A kind without a value, or whose values all have
-    defaults, needs none behind its colon."""
+    """Return what an entry of that kind is: one field, by the kind's name. A kind without a value, or whose values all
+    have defaults, needs none behind its colon."""
     return create_model(step.kind, __base__=Document, **cast("Any", {step.kind: (_get_form(step), ...)}))
 
 

@@ -101,7 +101,7 @@ class KnownStand:
     """Of the camera that takes longest to answer after it was switched on."""
 
     def set_point_way_s(self, from_degC: float, to_degC: float) -> float:
-        """How long the set-point itself is on its way, where it goes by a ramp."""
+        """Return how long the set-point itself is on its way, where it goes by a ramp."""
         del from_degC, to_degC
         return 0.0
 
@@ -128,30 +128,30 @@ class KnownStand:
         return 0.0
 
     def set_point_fault(self, chamber_degC: float) -> str:
-        """Why the stand may not have that set-point."""
+        """Return why the stand may not have that set-point."""
         del chamber_degC
         return ""
 
     def camera_fault(self) -> str:
-        """Why no camera can be used."""
+        """Return why no camera can be used."""
         return ""
 
     def supply_fault(self) -> str:
-        """Why the camera cannot be switched off."""
+        """Return why the camera cannot be switched off."""
         return ""
 
     def exposure_fault(self, chamber_degC: float) -> str:
-        """Why the flap must not be open at that set-point."""
+        """Return why the flap must not be open at that set-point."""
         del chamber_degC
         return ""
 
     def rate_fault(self, cameras: tuple[str, ...], interval_s: float | None) -> str:
-        """Why these cameras (none: all) cannot expose, one frame each `interval_s` when there are several."""
+        """Return why these cameras (none: all) cannot expose, one frame each `interval_s` when there are several."""
         del cameras, interval_s
         return ""
 
     def axis_fault(self, axis: str, position: float | None) -> str:
-        """Why the axis cannot go to `position`, mm or deg, or, with None, be homed from anywhere."""
+        """Return why the axis cannot go to `position`, mm or deg, or, with None, be homed from anywhere."""
         del axis, position
         return ""
 
@@ -189,7 +189,7 @@ class Price:
 
 
 def estimate_duration_s(steps: Iterable[Step]) -> float:
-    """What these steps take one after the other on a stand of which nothing is known, s."""
+    """Return what these steps take one after the other on a stand of which nothing is known, s."""
     found, total_s = Situation(), 0.0
     for step in steps:
         total_s += step.price(found, KnownStand()).duration_s
@@ -252,27 +252,27 @@ class Step:
         return 0
 
     def fault(self) -> str:
-        """Why its fields do not go together, as a clause; "" when they do."""
+        """Return why its fields do not go together, as a clause; "" when they do."""
         return ""
 
     def placement_fault(self, found: Situation) -> str:
-        """Why it cannot follow the steps before it, and what to do; "" when it can."""
+        """Return why it cannot follow the steps before it, and what to do; "" when it can."""
         del found
         return ""
 
     def stand_fault(self, stand: KnownStand) -> str:
-        """Why it is nothing for this stand, or outside its limits; "" when the stand can do it. Raises ConfigError
-        where a name is unknown."""
+        """Return why it is nothing for this stand, or outside its limits; "" when the stand can do it. Raises
+        ConfigError where a name is unknown."""
         del stand
         return ""
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
-        """How long it takes in the situation it finds."""
+        """Return how long it takes in the situation it finds."""
         del found, stand
         return Price(self.kind, 0.0)
 
     def situation_after(self, found: Situation) -> Situation:
-        """What is different when it is done."""
+        """Return what is different when it is done."""
         return found
 
     async def perform(self, stand: PerformingStand) -> None:

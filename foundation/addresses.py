@@ -70,7 +70,7 @@ def set_display_address(address: str, stated: str) -> None:
 
 
 def get_display_address(address: str) -> str:
-    """How a message names `address`: as the stand's file does."""
+    """Return how a message names `address`: as the stand's file does."""
     return _DISPLAY_ADDRESSES.get(address, address)
 
 

@@ -125,7 +125,7 @@ class WallClock:
         return self._minus_boot_ns(self._utc_ns) - self.boot.began_ns
 
     def suspended_ns(self) -> int:
-        """How long the host has been suspended since it was started."""
+        """Return how long the host has been suspended since it was started."""
         return -self._minus_boot_ns(self._awake_ns)
 
     def _minus_boot_ns(self, read_ns: Callable[[], int]) -> int:

@@ -133,7 +133,7 @@ def describe_faults(where: str, error: ValidationError, model: type[BaseModel], 
 
 
 def describe_yaml_error(error: yaml.YAMLError | ValueError) -> str:
-    """Why a text is no YAML, where, and what to look for."""
+    """Return why a text is no YAML, where, and what to look for."""
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
         problem = " ".join((error.problem or error.context or "").split())
@@ -146,7 +146,7 @@ def describe_yaml_error(error: yaml.YAMLError | ValueError) -> str:
 
 
 def describe_fault(fault: ErrorDetails, written: str | None = None) -> str:
-    """What is wrong with a value, and what to type; written: the value as it stands in the file, where that is
+    """Return what is wrong with a value, and what to type; written: the value as it stands in the file, where that is
     known."""
     kind, place = fault["type"], fault["loc"]
     if kind == "extra_forbidden":
@@ -233,7 +233,7 @@ def format_path(place: Iterable[int | str]) -> str:
 
 
 def _suggest_number(place: Place, value: object, *, whole: bool) -> str:
-    """What to type instead of this value."""
+    """Return what to type instead of this value."""
     key = next((part for part in reversed(place) if isinstance(part, str)), "")
     unit = next((end for end in _UNITS if key.endswith(f"_{end}")), "")
     text = f"give a {'whole ' if whole else ''}number" + (f" in {unit}, without the unit" if unit else "")
@@ -264,7 +264,7 @@ def _find_models(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
 
 
 def _find_types(model: type[BaseModel], place: Place) -> list[Any]:
-    """What may stand at this place; nothing where that is not known."""
+    """Return what may stand at this place; nothing where that is not known."""
     options: list[Any] = [model]
     for part in place:
         options = [inner for option in options for inner in _find_entry_types(option, part)]

@@ -105,9 +105,9 @@ def parse_document(text: str, model: type[Model], where: str) -> Model:
 
 
 def load_json(path: Path | str, read: Callable[[str], Read], what: str) -> Read:
-    """What `read` makes of the text of a JSON file that this program has written; SessionError, which says that it is
-    not `what`, when that refuses it, the file cannot be read or is far longer than any of ours, a key is given twice,
-    or values are nested deeper than Python goes."""
+    """Return what `read` makes of the text of a JSON file that this program has written; SessionError, which says that
+    it is not `what`, when that refuses it, the file cannot be read or is far longer than any of ours, a key is given
+    twice, or values are nested deeper than Python goes."""
     try:
         with Path(path).open("rb") as file:  # at most so much, also of a device without an end
             data = file.read(_LONGEST_JSON + 1)
@@ -147,13 +147,13 @@ def _reject_repeated_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def parse_yaml(text: str, where: str) -> object:
-    """What YAML text holds; ConfigError, which begins with `where`, when it is no YAML or far more than a document of
-    ours: a few lines of aliases stand for millions of values."""
+    """Return what YAML text holds; ConfigError, which begins with `where`, when it is no YAML or far more than a
+    document of ours: a few lines of aliases stand for millions of values."""
     return _load_yaml(text, where)[0]
 
 
 def _load_yaml(text: str, where: str) -> tuple[object, yaml.Node | None]:
-    """What YAML text holds, and as it is written."""
+    """Return what YAML text holds, and as it is written."""
     if len(text) > _LONGEST_TEXT:
         raise ConfigError(f"{where}: has {len(text)} characters; a file of this kind has at most {_LONGEST_TEXT}")
     if sum(map(text.count, "[{-?")) <= _MOST_OPENED:
@@ -179,8 +179,8 @@ def _construct(loader: _Loader | _FastLoader, where: str) -> tuple[object, yaml.
 
 
 def _count_values(node: yaml.Node, known: dict[int, int]) -> int:
-    """How many values a node stands for, each alias for as many as what it names; RecursionError when it is within
-    itself. `known`: of the nodes seen so far."""
+    """Return how many values a node stands for, each alias for as many as what it names; RecursionError when it is
+    within itself. `known`: of the nodes seen so far."""
     if not isinstance(node, yaml.CollectionNode):
         return 1
     if id(node) not in known:

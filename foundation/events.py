@@ -88,11 +88,11 @@ class EventKind(str):
         return Event(time_ns, self.get_level(data), str(self), text, data)
 
     def get_level(self, data: Data) -> Level:
-        """How grave it is with such data."""
+        """Return how grave it is with such data."""
         return self.level(data) if callable(self.level) else self.level
 
     def make_alert(self, data: Data) -> Alert | None:
-        """What it means for people elsewhere."""
+        """Return what it means for people elsewhere."""
         return self.alert(data) if callable(self.alert) else self.alert
 
     def format_text(self, text: str = "", /, **data: object) -> str:
@@ -169,7 +169,7 @@ def get_guard_kind(rule: str) -> EventKind:
 
 
 def get_advice(kind: str, data: Data, session: str = "") -> str:
-    """What helps, or shows more, after a warning or an error of that kind. session: the folder of the run's."""
+    """Return what helps, or shows more, after a warning or an error of that kind. session: the folder of the run's."""
     row = KINDS.get(kind)
     advice = "" if row is None else row.advice(data) if callable(row.advice) else row.advice
     if row is None and kind.startswith(GUARD):
@@ -178,7 +178,7 @@ def get_advice(kind: str, data: Data, session: str = "") -> str:
 
 
 def make_alert(event: Event) -> Alert | None:
-    """What the event means for people elsewhere; None for most."""
+    """Return what the event means for people elsewhere; None for most."""
     row = KINDS.get(event.kind)
     if row is None:
         return _make_guard_alert(event.data) if event.kind.startswith(GUARD) else None

@@ -16,7 +16,7 @@ from thermostand.foundation.errors import SessionError
 
 
 def describe_unreadable(path: Path | str, error: OSError | UnicodeDecodeError) -> str:
-    """Why the text file there cannot be read, as `path: sentence`."""
+    """Return why the text file there cannot be read, as `path: sentence`."""
     if isinstance(error, UnicodeDecodeError):
         line = error.object[: error.start].count(b"\n") + 1
         return f"{path}: cannot be read (line {line} is not UTF-8; save the file as UTF-8)"

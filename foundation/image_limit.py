@@ -23,7 +23,7 @@ def allow_images_up_to(megapixels: float) -> Generator[None]:
 
 
 def describe_size_fault(width_px: int, height_px: int) -> str:
-    """What is wrong with an image of that size, "" when it can be read."""
+    """Return what is wrong with an image of that size, "" when it can be read."""
     greatest = _greatest_megapixels.get()
     if width_px > 0 and height_px > 0 and width_px * height_px <= greatest * 1e6:
         return ""

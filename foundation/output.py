@@ -28,7 +28,7 @@ _OUTPUT: ContextVar[Output] = ContextVar("output", default=Output())  # noqa: B0
 
 
 def get_output() -> Output:
-    """What the command under way was asked for. In a thread of one's own: the defaults."""
+    """Return what the command under way was asked for. In a thread of one's own: the defaults."""
     return _OUTPUT.get()
 
 
@@ -60,6 +60,6 @@ def json_line(data: object) -> str:
 
 
 def say(line: object) -> None:
-    """What goes on, in one line on standard error; nothing when quiet."""
+    """Print what goes on, in one line on standard error; nothing when quiet."""
     if not get_output().quiet:
         typer.echo(escape_line(line), err=True)

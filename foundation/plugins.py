@@ -21,7 +21,7 @@ def get_package(point: EntryPoint) -> str:
 
 
 def load_point(point: EntryPoint) -> Any:
-    """What the entry point leads to; ConfigError when it cannot be imported."""
+    """Return what the entry point leads to; ConfigError when it cannot be imported."""
     try:
         return point.load()
     except Exception as error:  # importing a stranger's module may raise anything

@@ -28,7 +28,7 @@ class ShutdownDeadline:
             self._started.set()
 
     def limit_s(self, at_most_s: float) -> float:
-        """How long a wait may be that begins now."""
+        """Return how long a wait may be that begins now."""
         if self._deadline_s is None:
             return at_most_s
         return min(at_most_s, max(LEAST_S, self._deadline_s - asyncio.get_running_loop().time()))

@@ -10,7 +10,8 @@ Result = TypeVar("Result")
 
 
 async def run_with_background(work: Coroutine[None, None, Result], background: Sequence[asyncio.Task[None]]) -> Result:
-    """What `work` returns; raises at once what a background task raises: without time or polls nothing would wake it.
+    """Return what `work` returns; raises at once what a background task raises: without time or polls nothing would
+    wake it.
 
     On any other way out than its own, `work` has ended before this returns.
     """
@@ -51,7 +52,7 @@ async def wait_for_first(*waits: Coroutine[Any, Any, object]) -> int:
 
 
 def find_cause(error: BaseException) -> BaseException:
-    """What has really gone wrong: of a group of errors the first, but a lack of memory before all others."""
+    """Return what has really gone wrong: of a group of errors the first, but a lack of memory before all others."""
     if not isinstance(error, BaseExceptionGroup):
         return error
     leaves = [find_cause(each) for each in error.exceptions]

@@ -205,7 +205,7 @@ def _pickle(message: _Request | _Answer) -> bytes:
 
 
 def _answer(request: _Request, kept: dict[str, object]) -> _Answer:
-    """What comes of the request."""
+    """Return what comes of the request."""
     function, args, target, keep = request
     try:
         if isinstance(function, str):

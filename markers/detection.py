@@ -172,7 +172,7 @@ def _require_in_front(homography: Float, centres_mm: Float, radii_mm: Float) -> 
 def predict_edges(
     state: EdgeState, homography: Float, target: Target, clean: NDArray[np.bool_], which: NDArray[np.intp]
 ) -> PredictedEdges | None:
-    """What the `clean` (N,) markers of `state` say about those numbered `which` (K,), from 0.
+    """Return what the `clean` (N,) markers of `state` say about those numbered `which` (K,), from 0.
 
     Shapes deviate from the homography's ellipses, and blurs from each other, linearly over the target; only markers of
     the same size are asked, as a print grows all its outlines by the same width. Levels are those of the nearest clean
@@ -422,8 +422,8 @@ def predict_rows(previous: Detection, target: Target, height: int) -> Mask:
 def follow(
     image: NDArray[np.uint8], rows: Mask, target: Target, previous: Detection, noise: Noise | None = None
 ) -> Detection | None:
-    """What `detect` finds by going on from `previous`, from an image (height, width) of which only `rows` are there.
-    None where that takes more of it, or another way, to find out: `detect` does it in the whole image."""
+    """Return what `detect` finds by going on from `previous`, from an image (height, width) of which only `rows` are
+    there. None where that takes more of it, or another way, to find out: `detect` does it in the whole image."""
     picture = make_picture(image, rows)
     followed = _follow(picture, target, previous, noise)
     return None if picture.missed[0] else followed

@@ -124,7 +124,7 @@ def _shift_best_table(tables: list[Index], points: Float, target: Target) -> lis
 
 
 def _count_within_reach(candidate: Index, points: Float, tree: KDTree, target: Target) -> int:
-    """How many markers have a candidate near where the homography of those in the table puts them."""
+    """Return how many markers have a candidate near where the homography of those in the table puts them."""
     target_mm = target.coordinates_mm()
     seen = candidate >= 0
     try:
@@ -291,8 +291,8 @@ def _compute_odd_size_ratio(placement: GridPlacement, candidates: Candidates, ta
 
 
 def _count_wrong_holes(placement: GridPlacement, candidates: Candidates, target: Target) -> int:
-    """How many markers have a hole that should have none, or none that should have one; marks that are not seen count
-    as well."""
+    """Return how many markers have a hole that should have none, or none that should have one; marks that are not seen
+    count as well."""
     seen, donut = placement.candidate >= 0, target.is_donut()
     hollow: NDArray[np.bool_] = candidates.hollow[placement.candidate] > 0.5 * target.hole_part
     return int(np.count_nonzero((hollow != donut)[seen])) + int(np.count_nonzero(donut & ~seen))

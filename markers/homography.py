@@ -39,7 +39,8 @@ def fit_homography(target_mm: Float, centres_px: Float) -> Float:
 
 
 def check_homography(found: object) -> Float:
-    """What cv2.findHomography gave, as an array; DetectionError when it gave none, or one that cannot be inverted."""
+    """Return what cv2.findHomography gave, as an array; DetectionError when it gave none, or one that cannot be
+    inverted."""
     homography = np.full((3, 3), np.nan) if found is None else np.asarray(found, dtype=np.float64)
     if not np.isfinite(homography).all() or np.linalg.det(homography) == 0:
         raise DetectionError(_NOT_FLAT)

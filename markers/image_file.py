@@ -50,7 +50,8 @@ def read_image(path: Path | str) -> Image:
 
 
 def _describe_orientation(orientation: int) -> str:
-    """What an EXIF orientation says against reading the pixels as they are stored, "" when it is upright or unknown."""
+    """Return what an EXIF orientation says against reading the pixels as they are stored, "" when it is upright or
+    unknown."""
     if orientation <= _UPRIGHT or orientation > max(_TURNS):
         return ""
     return (
@@ -60,7 +61,7 @@ def _describe_orientation(orientation: int) -> str:
 
 
 def _find_fault(data: bytes) -> str:
-    """What its header says against reading it, "" when nothing."""
+    """Return what its header says against reading it, "" when nothing."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of what is below our limit

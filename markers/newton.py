@@ -265,7 +265,7 @@ def solve_newton_step(work: Work) -> Float:
 
 @compile_part
 def compute_gain(work: Work, step: Float) -> float:
-    """What a step takes from the sum of squared residuals."""
+    """Return what a step takes from the sum of squared residuals."""
     total = 0.0
     for i in range(PARAMETERS):
         total += work.right[i] * step[i]

@@ -109,7 +109,7 @@ def compute_centre_scatter(
 
 @compile_part
 def _set_core_influences(rows: Single, inverse: Float, size: int, seen: Single) -> None:
-    """What pixels near the outline move the centre by, and their residuals, from their derivatives."""
+    """Set what pixels near the outline move the centre by, and their residuals, from their derivatives."""
     for k in range(size):
         seen[_G, k], seen[_H, k], seen[_E, k] = _ZERO, _ZERO, rows[ERROR, k]
     for i in range(PARAMETERS):

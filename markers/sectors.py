@@ -41,7 +41,7 @@ def make_all_kept() -> Bools:
 
 @compile_part
 def count_kept(kept: Bools) -> int:
-    """How many sectors are kept."""
+    """Return how many sectors are kept."""
     number = 0
     for place in range(SECTORS):
         number += kept[place]
@@ -72,7 +72,7 @@ def mask_sectors(pixels: Pixels, p: Float, kept: Bools) -> None:
 
 @compile_part
 def compute_deviations(pixels: Pixels, p: Float) -> Float:
-    """What each sector deviates from the model, in standard deviations, (3, 36): its outline (CORE), its levels
+    """Return what each sector deviates from the model, in standard deviations, (3, 36): its outline (CORE), its levels
     further out and further in (GROUND, DISC). NaN where there are no pixels."""
     found, places = np.empty((3, SECTORS)), np.empty(_BLOCK, np.int32)
     sums = np.empty((2, SECTORS, 2))  # neighbours are mostly in one sector: they take turns, not to wait for each other
@@ -106,7 +106,7 @@ def compute_misfits(pixels: Pixels, p: Float) -> tuple[float, float]:
 
 @compile_part
 def compute_sector_misfits(pixels: Pixels, p: Float) -> Float:
-    """How unlike the model each sector (36,) is, in standard deviations: the largest of its deviations, and its
+    """Return how unlike the model each sector (36,) is, in standard deviations: the largest of its deviations, and its
     squared residuals altogether. 0 where no pixel counts."""
     squares, count, places = np.zeros(SECTORS), np.zeros(SECTORS), np.empty(_BLOCK, np.int32)
     for region in range(3):

@@ -332,7 +332,7 @@ def correct_image(image: Image, model: DriftModel, states: States) -> NDArray[np
 
 
 def compute_middle_flags(model: DriftModel, states: States) -> int:
-    """Why the correction at the middle of the image is an extrapolation (Outside), 0 when it is not."""
+    """Return why the correction at the middle of the image is an extrapolation (Outside), 0 when it is not."""
     width, height = model.facts.image_size
     return int(model.flags(np.array([[(width - 1) / 2, (height - 1) / 2]]), states)[0])
 

@@ -40,8 +40,8 @@ def export_runtime(model: DriftModel, folder: Path) -> tuple[Path, Path]:
 
 
 def build_runtime_model(model: DriftModel) -> dict[str, object]:
-    """What drift_runtime.Drift takes, as JSON values: no covariance; discrepancy_px is one standard deviation of the
-    correction inside the calibrated range."""
+    """Return what drift_runtime.Drift takes, as JSON values: no covariance; discrepancy_px is one standard deviation of
+    the correction inside the calibrated range."""
     facts = model.facts
     common: dict[str, object] = {
         "format": "thermostand drift runtime",
@@ -170,7 +170,7 @@ def _render_constants(model: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _render_functions(model: Mapping[str, Any]) -> Iterator[str]:
-    """How the state's values go on, and the terms of them."""
+    """Return how the state's values go on, and the terms of them."""
     at: dict[Any, int] = drift_runtime.Drift(model).state.memory.at
     values, means = ({part: f"{name}[{place}]" for part, place in at.items()} for name in ("now", "mean"))
     remembered = list(at)[len(drift_runtime.INPUTS) :]

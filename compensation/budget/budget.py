@@ -129,7 +129,7 @@ Float = NDArray[np.float64]
 def compute_ray_shift_mm(
     radius_mm: Float | float, distance_mm: float, interface_mm: float, n1: float, n2: float
 ) -> Float:
-    """How much further out the ray arrives, mm, for radii of any shape; negative when n1 < n2 (warm camera)."""
+    """Return how much further out the ray arrives, mm, for radii of any shape; negative when n1 < n2 (warm camera)."""
     tangent = np.asarray(radius_mm, dtype=np.float64) / distance_mm
     sine = n1 / n2 * tangent / np.sqrt(1 + tangent**2)
     return (distance_mm - interface_mm) * (sine / np.sqrt(1 - sine**2) - tangent)
@@ -143,7 +143,8 @@ def compute_tilt_shift_mm(tilt_rad: float, distance_mm: float, interface_mm: flo
 def compute_refraction_px(
     offset_px: Float, focal_px: float, distance_mm: float, interface_mm: float, n1: float, n2: float
 ) -> Float:
-    """How far an image point (..., 2), px from the principal point, is moved: outwards when the camera's air is warm.
+    """Return how far an image point (..., 2), px from the principal point, is moved: outwards when the camera's air is
+    warm.
 
     The ray that reaches the target's point left at a smaller radius by `shift_mm`, to first order in it.
     """
@@ -174,7 +175,8 @@ def measure_home_repeatability(events: Sequence[Event], unit: str) -> Repeatabil
 
 
 def measure_v0_repeatability(session: Session, target: Target) -> Repeatability:
-    """How far the image of V0 is from where it was, when the table returns to it at the end of a temperature, px.
+    """Return how far the image of V0 is from where it was, when the table returns to it at the end of a temperature,
+    px.
 
     Per coordinate, over all markers and temperatures; frames of a capture are averaged. The camera's drift in
     these minutes is included: an upper limit.
@@ -257,7 +259,7 @@ def vary_inputs(state: ThermometerState, geometry: Geometry) -> Iterator[tuple[T
 
 
 def compute_granite_mm(state: ThermometerState, reference: ThermometerState, geometry: Geometry) -> float:
-    """How much the base has moved the target away from the camera."""
+    """Return how much the base has moved the target away from the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     outside_K = state.granite_outside_degC - reference.granite_outside_degC
     lengths_mm_K = geometry.granite_inside_mm.value * inside_K + geometry.granite_outside_mm.value * outside_K
@@ -265,7 +267,7 @@ def compute_granite_mm(state: ThermometerState, reference: ThermometerState, geo
 
 
 def compute_post_mm(state: ThermometerState, reference: ThermometerState, geometry: Geometry) -> float:
-    """How much the post has lifted the camera."""
+    """Return how much the post has lifted the camera."""
     inside_K = state.granite_inside_degC - reference.granite_inside_degC
     return geometry.granite_per_K.value * geometry.post_mm.value * inside_K
 
@@ -278,7 +280,8 @@ def compute_target_strain(state: ThermometerState, reference: ThermometerState, 
 def compute_air_refraction_px(
     state: ThermometerState, geometry: Geometry, offset_px: Float, index: Index = ciddor_1996
 ) -> Float:
-    """How far points (..., 2), px from the principal point, appear outwards by the air's indices on both sides."""
+    """Return how far points (..., 2), px from the principal point, appear outwards by the air's indices on both
+    sides."""
     n1, n2 = compute_indices(state, geometry, index)
     return compute_refraction_px(
         offset_px, geometry.focal_px, geometry.distance_mm.value, geometry.interface_mm.value, n1, n2

@@ -49,7 +49,7 @@ Check = TypeVar("Check")
 
 
 def try_check(check: Callable[[], Check]) -> tuple[Check | None, str]:
-    """What a check of a result gives, or None and why it cannot be made: the result stands without it."""
+    """Return what a check of a result gives, or None and why it cannot be made: the result stands without it."""
     try:
         return check(), ""
     except CalibrationError as error:
@@ -62,8 +62,8 @@ def fit_ray_lens(adjustment: Adjustment, degree: int) -> RayLens:
 
 
 def compute_rms_ratio(adjustment: Adjustment, rays: RayLens, scores: tuple[ModelScore, ...]) -> float:
-    """What the rays leave over what the pinhole leaves: RMS at held-out positions, and without these residuals in
-    units of the noise and of what the pinhole does not explain."""
+    """Return what the rays leave over what the pinhole leaves: RMS at held-out positions, and without these residuals
+    in units of the noise and of what the pinhole does not explain."""
     of = {score.model: score.rms_px for score in scores}
     if scores:
         return of[format_ray_name(rays.degree)] / min(of[BROWN], of[RATIONAL])
@@ -100,14 +100,14 @@ def select_model(scores: tuple[ModelScore, ...]) -> str:
 def compare_halves(
     positions: Positions, board: Board, sigma: TableSigma, distance_mm: float, *, rational: bool
 ) -> CameraDifference:
-    """What the calibrations from every other position and from the rest say differently."""
+    """Return what the calibrations from every other position and from the rest say differently."""
     odd = np.arange(len(positions.linear_mm)) % 2 == 1
     first, second = (adjust(positions.select(chosen), board, sigma, rational=rational) for chosen in (~odd, odd))
     return compare_calibrations(first, second, distance_mm)
 
 
 def format_ray_name(degree: int) -> str:
-    """What the ray model of a degree is called in a score."""
+    """Return what the ray model of a degree is called in a score."""
     return f"rays, degree {degree}"
 
 

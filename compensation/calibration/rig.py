@@ -76,7 +76,8 @@ class RigCalibration:
         return np.degrees(sigma[:3]), sigma[3:]
 
     def compute_baseline_mm(self, camera: int) -> tuple[float, float]:
-        """How far a camera's centre of projection is from the first one's, and the standard uncertainty of that, mm."""
+        """Return how far a camera's centre of projection is from the first one's, and the standard uncertainty of that,
+        mm."""
         shift = self.scene.translations_mm[camera]
         length = float(np.linalg.norm(shift))
         covariance = self._get_pose_covariance(camera)[3:, 3:]

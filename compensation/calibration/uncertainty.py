@@ -105,7 +105,8 @@ class CameraDifference:
 def compare_calibrations(
     first: Adjustment, second: Adjustment, distance_mm: float, columns: int = 25
 ) -> CameraDifference:
-    """How two calibrations from different positions of one table differ, their frames brought together by the table."""
+    """Return how two calibrations from different positions of one table differ, their frames brought together by the
+    table."""
     turn, shift = _align_tables(first, second)
     pixels = make_pixel_grid(first.scene.lens.image_size, columns)
     slopes = first.scene.lens.compute_slopes(pixels)

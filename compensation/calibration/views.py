@@ -89,7 +89,7 @@ class PointUncertainty:
 
 
 def compute_point_uncertainty(found: ViewCalibration, distance_mm: float) -> PointUncertainty:
-    """How well it knows points at Z = distance_mm."""
+    """Return how well it knows points at Z = distance_mm."""
     width, height = found.scene.lens.image_size
     corners = [(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)]
     pixels = np.array([((width - 1) / 2, (height - 1) / 2), *corners], np.float64)

@@ -254,7 +254,7 @@ def _format_bump(bump: Bump, observations: Observations) -> str:
 
 
 def _describe_scores(evaluation: Evaluation) -> dict[str, object]:
-    """What compensation gains, for programs; RMS along x and y, px."""
+    """Return what compensation gains, for programs; RMS along x and y, px."""
     return {
         "method": evaluation.method,
         "frames": evaluation.frames,

@@ -261,7 +261,7 @@ def format_summary(
 
 
 def make_prior_board(board: Target | BoardOfCorners) -> Board:
-    """What is known of it before a calibration."""
+    """Return what is known of it before a calibration."""
     return make_board(board) if isinstance(board, Target) else make_corner_board(board)
 
 
@@ -272,8 +272,8 @@ def collect_views(
     suspect: list[str],
     report: Report,
 ) -> Views:
-    """What a camera sees in each of its pictures, NaN where there is none or it does not show enough; `failures` grows
-    by a line for each that is not used, `suspect` by the names of those that noise does not describe.
+    """Return what a camera sees in each of its pictures, NaN where there is none or it does not show enough; `failures`
+    grows by a line for each that is not used, `suspect` by the names of those that noise does not describe.
 
     CalibrationError when the target is in none, or they are of different sizes.
     """

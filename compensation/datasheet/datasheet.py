@@ -524,7 +524,7 @@ def _compute_camera_share(
 
 
 def _compute_surroundings_share(share: MeasuredQuantity) -> MeasuredQuantity:
-    """What the camera's share leaves, as uncertain as that."""
+    """Return what the camera's share leaves, as uncertain as that."""
     lines = tuple(replace(line, sensitivity=-line.sensitivity) for line in share.contributions)
     name, model = "Part of the shift that follows mount and surroundings", "100 % less the part that follows the camera"
     return replace(share, key="mount_share", name=name, value=100 - share.value, model=model, contributions=lines)

@@ -103,7 +103,8 @@ def concatenate_states(parts: Sequence[ForecastState]) -> ForecastState:
 
 
 def fit_surroundings(observations: Observations, ramp_K_per_min: float) -> CameraSurroundings:
-    """What the last session says; SessionError when it has no history of the air or too few readings of the camera."""
+    """Return what the last session says; SessionError when it has no history of the air or too few readings of the
+    camera."""
     history = observations.histories[-1] if observations.histories else None
     if history is None or not history.has_ambient or len(history.camera_ns) < 10 * _EVERY_READING:
         raise SessionError("the session has no history of air and camera; nothing can be foreseen")
@@ -363,7 +364,7 @@ class Decision:
 
 
 def decide(observations: Observations, wanted: DesignGoal) -> Decision:
-    """What to do next. While no model can be fitted, the temperature that is furthest from those visited."""
+    """Return what to do next. While no model can be fitted, the temperature that is furthest from those visited."""
     grid = _make_grid(wanted)
     try:
         model = fit_thermal(observations)

@@ -140,7 +140,7 @@ def _cross_validate(model: DriftModel, observations: Observations) -> tuple[Disp
 
 
 def _select_answered(rows: Displacements, after: Float) -> tuple[Displacements, Float]:
-    """What the model had an answer for; it has none where the thermal state is unknown."""
+    """Return what the model had an answer for; it has none where the thermal state is unknown."""
     known: Mask = np.isfinite(after[:, 0])
     if not known.any():
         raise SessionError("no markers are left to score the model with")

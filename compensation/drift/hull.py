@@ -35,7 +35,7 @@ def is_area(hull_px: Float) -> bool:
 
 
 def compute_distances_px(xy_px: Float, hull_px: Float) -> Float:
-    """How far points (N, 2) are inside each side of the hull (H, 2), shape (N, H); negative is outside."""
+    """Return how far points (N, 2) are inside each side of the hull (H, 2), shape (N, H); negative is outside."""
     sides = np.roll(hull_px, -1, axis=0) - hull_px
     along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
     offset = xy_px[:, None] - hull_px

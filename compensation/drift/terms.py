@@ -224,7 +224,7 @@ class HiddenBacklashTerm(Term):
 
 
 def list_usual_terms() -> tuple[Term, ...]:
-    """What a camera may be moved by: the terms of a fit. ConfigError where a package's cannot be loaded."""
+    """Return what a camera may be moved by: the terms of a fit. ConfigError where a package's cannot be loaded."""
     for point in entry_points(group=GROUP):
         load_point(point)
     return tuple(term for kind in TERMS.values() for term in kind.usual())
@@ -250,8 +250,8 @@ def parse_term(value: object) -> Term:
 
 
 def build_state_spec(terms: Sequence[Term], self_heating_K: float) -> ThermalStateSpec:
-    """What the terms need remembered, and a lag of the ambient in any case: its range is part of where a model holds,
-    also where a warm-up has shown the camera at every temperature."""
+    """Return what the terms need remembered, and a lag of the ambient in any case: its range is part of where a model
+    holds, also where a warm-up has shown the camera at every temperature."""
     parts = remembered([term.feature for term in terms])
     quickest = () if any(part[:2] == ("lag", AIR) for part in parts) else (lag(AIR, _QUICK_S),)
     return ThermalStateSpec((*parts, *quickest), self_heating_K)

@@ -359,8 +359,8 @@ def _compute_more_px(taught: _ThermalFit, claims: Claims) -> Pair:
 
 
 def _compute_history_s(model: ThermalModel) -> float:
-    """How long until what was guessed of the thermal state moves the image by less than the model is uncertain. A guess
-    is wrong by the same for all lags."""
+    """Return how long until what was guessed of the thermal state moves the image by less than the model is uncertain.
+    A guess is wrong by the same for all lags."""
     limit_px = max(float(np.hypot(*model.discrepancy_px)), _LEAST_PX)
     moved = compute_motions(model.facts.hull_px, model.facts.image_size)
     guesses = [
@@ -390,7 +390,7 @@ def _propagate_initial_error(model: ThermalModel, wrong_K: Float) -> tuple[Float
 
 
 def _compute_range(trained: Training) -> ThermalRange:
-    """What the training frames covered; the quickest lag stands for the ambient."""
+    """Return what the training frames covered; the quickest lag stands for the ambient."""
     states = trained.states.where(np.unique(trained.rows.frame))
     return ThermalRange(
         ambient_degC=_compute_extent(states.of([states.memory.ambient_lag])),

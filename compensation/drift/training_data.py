@@ -178,7 +178,8 @@ def compute_frame_states(observations: Observations, memory: ThermalStateSpec) -
 
 
 def estimate_self_heating_K(observations: Observations) -> float:
-    """How much warmer than the air the camera is at the reference; SessionError when the air there is unknown."""
+    """Return how much warmer than the air the camera is at the reference; SessionError when the air there is
+    unknown."""
     reference = observations.of(Role.REFERENCE)
     excess_K = (observations.camera_degC - observations.air_degC)[reference]
     if not np.isfinite(excess_K).any():

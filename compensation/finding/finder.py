@@ -47,7 +47,7 @@ def compute_key(piece: Piece, places: Sequence[FramePlace]) -> str:
 
 
 def load_markers(folder: Path, key: str) -> FoundMarkers | None:
-    """What is kept under `key`; None when there is nothing, or nothing that can be read."""
+    """Return what is kept under `key`; None when there is nothing, or nothing that can be read."""
     try:
         with (folder / f"{key}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return FoundMarkers(**{field.name: arrays[field.name] for field in fields(FoundMarkers)})

@@ -153,7 +153,8 @@ class ThermalHistory:
 
 
 def read_history(session: Session, until_ns: int | None = None) -> ThermalHistory:
-    """What the session's telemetry has of it, to that instant or its end; a channel that was not recorded is empty."""
+    """Return what the session's telemetry has of it, to that instant or its end; a channel that was not recorded is
+    empty."""
     columns = (
         _read_good_values(session, _AMBIENT),
         _read_supply(session),

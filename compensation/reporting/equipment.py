@@ -30,7 +30,7 @@ def list_equipment(session: Session) -> list[Line]:
 
 
 def _list_identities(session: Session) -> Iterator[Line]:
-    """What each device, or its register map, last stated about it; the camera of these frames comes first."""
+    """Return what each device, or its register map, last stated about it; the camera of these frames comes first."""
     found: dict[str, dict[str, Any]] = {}
     for event in session.events():
         if event.kind == DEVICE_IDENTITY:
@@ -102,7 +102,7 @@ def _describe_sensor(name: object, sensor: Any) -> str:
 
 
 def list_stated_details(details: MeasurementDetails, target: Target) -> list[Line]:
-    """What somebody has stated, and which of what a reader asks for nobody has."""
+    """Return what somebody has stated, and which of what a reader asks for nobody has."""
     distance = "" if details.working_distance_mm is None else f"target {details.working_distance_mm:g} mm away"
     rows = [
         ("Lens", ", ".join(text for text in (details.lens, details.aperture, distance) if text)),

@@ -92,7 +92,7 @@ def format_with_limit(value_um: float, u_um: float) -> str:
 
 
 def describe_flags(validation: SpatialValidation) -> str:
-    """What of the corrections was beyond the model's valid range, and why."""
+    """Return what of the corrections was beyond the model's valid range, and why."""
     reasons = Outside(int(np.bitwise_or.reduce(validation.flags[np.isfinite(validation.outside)], axis=None)))
     share = float(np.nanmean(validation.outside))
     if not reasons:

@@ -131,7 +131,7 @@ class DeviceCheck:
 
 
 async def check_answers(look: DeviceCheck) -> None:
-    """What there is to look at in most devices."""
+    """Check what most devices have in common."""
     await look.open_and_read()
 
 
@@ -169,7 +169,7 @@ def _classify_error(error: StandError) -> str:
 
 
 def check_identity(device: Device) -> Finding:
-    """What a device that answers tells of itself, and what it does not."""
+    """Return what a device that answers tells of itself, and what it does not."""
     identity = device.identity
     if identity is None:
         return Finding(device.name, "identity", "ok", "answers; it does not tell what it is")

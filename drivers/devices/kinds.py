@@ -210,7 +210,7 @@ class DeviceKind:
 
 
 def _explain_channel_name(name: str, names: Sequence[str]) -> str:
-    """Why readings cannot be found by that name among these; "" when they can."""
+    """Return why readings cannot be found by that name among these; "" when they can."""
     if not _CHANNEL_NAME.fullmatch(name):
         return "and a channel's name is of letters, digits and _, a letter first, at most 40; correct the package"
     return "twice; a channel has one name and one unit: correct the package" if names.count(name) > 1 else ""
@@ -229,7 +229,7 @@ class Equipment(NamedTuple):
         return self.kind.stand_in_s if self.settings is None else self.settings.poll_s
 
     def channels(self, of_section: OfSection, map_of: MapOf) -> tuple[Channel, ...]:
-        """What it measures; ConfigError when it declares what cannot be recorded under its name."""
+        """Return what it measures; ConfigError when it declares what cannot be recorded under its name."""
         declared = self.kind.channels
         found = declared if isinstance(declared, tuple) else (*declared(self.settings, of_section, map_of),)
         names = [each.name for each in found]

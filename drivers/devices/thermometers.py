@@ -234,8 +234,8 @@ _LOOKS, _PERIOD_S = 5, 0.3
 
 
 async def _compare_thermometers(thermometers: Sensor, regulator: Sensor | None, warn_K: float, clock: Clock) -> Finding:
-    """How far each is from the median of all, the regulator's own value among them; a warning beyond `warn_K`. In a
-    chamber that has been at rest overnight they all show the same."""
+    """Return how far each is from the median of all, the regulator's own value among them; a warning beyond `warn_K`.
+    In a chamber that has been at rest overnight they all show the same."""
     seen: dict[str, list[float]] = {}
     try:
         for _ in range(_LOOKS):

@@ -343,7 +343,7 @@ class Laboratory:
                     module.far_air_degC = lambda camera=camera: camera.far_air_degC
 
     def _optics_of(self, name: str) -> CameraKind | PublishedCamera:
-        """What the camera of this name is."""
+        """Return what the camera of this name is."""
         spec = self._cameras.get(name)
         kind = self.spec.camera_kind if spec is None else spec.optics or self.spec.camera_kind
         return self.published.get(name, kind)

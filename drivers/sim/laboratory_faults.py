@@ -516,7 +516,7 @@ class FaultSchedule:
         self._break_until(start_ns)
 
     def list_standing(self) -> dict[str, object]:
-        """What is broken now, with its value; what just happens (a restart) is not."""
+        """Return what is broken now, with its value; what just happens (a restart) is not."""
         with self._lock:
             return dict(self._standing)
 

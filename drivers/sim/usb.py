@@ -83,7 +83,7 @@ class FakeUsbDevice(Protocol):
     def control_transfer(
         self, request_type: int, request: int, value: int, index: int, length_or_data: int | bytes
     ) -> bytes:
-        """What was read, b"" for a write; raises TransferFailed."""
+        """Return what was read, b"" for a write; raises TransferFailed."""
         ...
 
 

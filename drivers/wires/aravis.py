@@ -161,7 +161,7 @@ class GigeDevice:
         self._call("arv_camera_set_string", feature.encode(), value.encode())
 
     def entries(self, feature: str) -> tuple[str, ...]:
-        """What an Enumeration feature offers now, in the camera's order."""
+        """Return what an Enumeration feature offers now, in the camera's order."""
         count = ctypes.c_uint()
         names = self._call("arv_camera_dup_available_enumerations_as_strings", feature.encode(), ctypes.byref(count))
         try:
@@ -265,7 +265,7 @@ class GigeStream:
         self._call("arv_stream_push_buffer", buffer)
 
     def info(self, buffer: int) -> BufferInfo:
-        """What the buffer says of itself; sizes are 0 unless it is complete."""
+        """Return what the buffer says of itself; sizes are 0 unless it is complete."""
         get = self._library
         status = int(get["arv_buffer_get_status"](buffer))
         complete = status == BUFFER_SUCCESS

@@ -121,7 +121,7 @@ def _find_feature(device: GigeDevice, names: Iterable[str]) -> str:
 
 
 def _list_offered(device: GigeDevice, feature: str) -> tuple[str, ...]:
-    """What an enumeration offers; nothing when the camera has no such."""
+    """Return what an enumeration offers; nothing when the camera has no such."""
     return device.entries(feature) if device.kind(feature) == "Enumeration" else ()
 
 
@@ -321,7 +321,7 @@ def _set_packets(name: str, device: GigeDevice, settings: GigeCameraSettings) ->
 
 
 def _compute_receive_buffer_bytes(payload_bytes: int) -> int:
-    """What to ask of the kernel, which grants no more than net.core.rmem_max (raise it with sysctl).
+    """Return what to ask of the kernel, which grants no more than net.core.rmem_max (raise it with sysctl).
 
     Twice a frame, because the kernel also counts what it adds to each packet (2.3 kB for 1.4 kB of image); Aravis' own
     choice is one frame, and small images lose packets.

@@ -12,7 +12,7 @@ _MARGIN = 1.1  # packets of the control channel, and senders that are not quite 
 
 
 def compute_packet_wire_ns(packet_size: int, line_Mbps: float) -> float:
-    """How long an IP packet of so many bytes takes on the line."""
+    """Return how long an IP packet of so many bytes takes on the line."""
     return (packet_size + ETHERNET_BYTES) * 8 / line_Mbps * 1e3
 
 
@@ -22,6 +22,6 @@ def compute_packet_delay_ns(packet_size: int, line_Mbps: float, shared_by: int) 
 
 
 def compute_frame_wire_s(frame_bytes: int, packet_size: int, line_Mbps: float, delay_ns: int = 0) -> float:
-    """How long a frame takes to arrive: its packets, leader and trailer, with the pauses."""
+    """Return how long a frame takes to arrive: its packets, leader and trailer, with the pauses."""
     packets = -(-frame_bytes // (packet_size - GVSP_BYTES)) + 2
     return packets * (compute_packet_wire_ns(packet_size, line_Mbps) + delay_ns) / NS_PER_S

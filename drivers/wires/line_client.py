@@ -128,14 +128,14 @@ class LineClient:
         return True
 
     def _flow_count(self, heard: bytes) -> int:
-        """How much of it may be a damaged character: what comes behind the end is none."""
+        """Return how much of it may be a damaged character: what comes behind the end is none."""
         whole = heard.rstrip(_FLOW_CONTROL) if self._is_text else b""
         return sum(whole.count(each) for each in _FLOW_CONTROL)
 
     def _exchange(
         self, request: bytes, answer: Callable[[bytes], Answer | None], *, is_read: bool
     ) -> tuple[Answer, bytes]:
-        """What `answer` makes of the reply, and the reply as it came."""
+        """Return what `answer` makes of the reply, and the reply as it came."""
         self._is_swallowed = self._is_asked_again = False
         link = self._clean_link(is_read=is_read)
         is_first, self._is_first = self._is_first, False
@@ -216,7 +216,7 @@ class LineClient:
 
 
 def _discard(link: ByteLink) -> None:
-    """What nobody asked for; Unreachable when the peer has closed the link."""
+    """Discard what nobody asked for; Unreachable when the peer has closed the link."""
     while link.read(0.0):
         pass
 

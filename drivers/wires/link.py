@@ -33,7 +33,8 @@ class ByteLink(Protocol):
         ...
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived, waiting at most `timeout_s` (0: not at all) for the first byte; b"" when nothing came."""
+        """Return what has arrived, waiting at most `timeout_s` (0: not at all) for the first byte; b"" when nothing
+        came."""
         ...
 
     def close(self) -> None:
@@ -117,7 +118,7 @@ class _SerialLink:
 
 
 def _write_at_once(port: int, data: bytes) -> int:
-    """How many bytes the port has space for."""
+    """Return how many bytes the port has space for."""
     try:
         return os.write(port, data)
     except BlockingIOError:
@@ -158,7 +159,7 @@ class HangUps:
 
 
 def explain_closed(error: Exception) -> str:
-    """Why a port cannot be opened, in one clause: the words of pyserial have its name twice."""
+    """Return why a port cannot be opened, in one clause: the words of pyserial have its name twice."""
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EAGAIN, errno.EBUSY):
         return "another program has it open"

@@ -284,7 +284,7 @@ class TcpClient(ModbusTcpClient):
             return True
 
     def recv(self, size: int | None) -> bytes:
-        """What has come; b"" after the time-out."""
+        """Return what has come; b"" after the time-out."""
         if self.socket is None:
             raise ConnectionException("connection closed")
         try:
@@ -312,7 +312,7 @@ def _is_reply(packet: bytes, heard: bytes) -> bool:
 
 
 def _explain_foreign(packet: bytes, heard: bytes) -> str:
-    """Why what was heard answers another request than this one, or is of another protocol; "" when it may be its
+    """Return why what was heard answers another request than this one, or is of another protocol; "" when it may be its
     reply."""
     is_rtu = heard[:4] != packet[:4] and heard[:1] == packet[6:7] and len(heard) > _SHORTEST_RTU
     if is_rtu and FramerRTU.compute_CRC(heard[:-2]) == int.from_bytes(heard[-2:], "big"):

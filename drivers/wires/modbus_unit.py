@@ -98,7 +98,7 @@ class ModbusUnit:
         self.identity = check_same_device(self.name, await self._read_identity(), self.identity)
 
     async def _read_identity(self) -> Identity:
-        """What the unit tells of itself; vendor and model are otherwise those of the map."""
+        """Return what the unit tells of itself; vendor and model are otherwise those of the map."""
         stated = {field: await self._identity_field(stated) for field, stated in self.map.identity.items()}
         model = stated.get("model", "")
         return Identity(
@@ -202,8 +202,8 @@ def is_confirmed(command: RegisterCommand, snapshot: Snapshot) -> bool:
 
 
 def find_objection(check: InForceCheck, snapshot: Snapshot) -> str:
-    """Why the set-point that was written is not the one that acts, by a snapshot that has read the points of the check;
-    "" when this one does not object."""
+    """Return why the set-point that was written is not the one that acts, by a snapshot that has read the points of the
+    check; "" when this one does not object."""
     if check.bit:
         return "" if snapshot.bits[check.bit] == check.is_ else f"{check.says} ({check.bit} is {int(not check.is_)})"
     found, wanted = snapshot.samples[check.point], check.equals
@@ -279,7 +279,7 @@ def decode(point: Point, words: list[int]) -> Sample:
 
 
 def _to_number(kind: PointType, raw: int) -> float:
-    """What the raw word or words stand for."""
+    """Return what the raw word or words stand for."""
     match kind:
         case "int16":
             return raw - (raw >> 15 << 16)

@@ -57,7 +57,7 @@ class DeletionRule:
 
 
 def explain_unfit(entry: ListedSession) -> str:
-    """Why a session is not copied now; "" when it may be."""
+    """Return why a session is not copied now; "" when it may be."""
     if any(state in (SegmentState.RECORDING, SegmentState.UNFINISHED) for _, state, _ in entry.segments):
         return "is being recorded, or was never finished (`stand session repair`)"
     return "" if entry.run in _OVER else f"its run is {entry.run} and may be resumed"

@@ -139,7 +139,7 @@ class _ExportProgress:
 
 
 def _write_facts(session: Session, folder: Path) -> None:
-    """What is small: metadata, attachments, steps and events."""
+    """Write what is small: metadata, attachments, steps and events."""
     utc = session.utc
     state = describe_state(session)
     (folder / "README.txt").write_text(README + state.text, encoding="utf-8")

@@ -82,7 +82,7 @@ def _make_meta_row(meta: messages.FrameMeta, utc: UtcOffsets) -> Sequence[Cell]:
 
 
 def _collect_channels(session: Session) -> dict[str, tuple[Channel, ...]]:
-    """What each device declares, then what it was read to measure besides."""
+    """Return what each device declares, then what it was read to measure besides."""
     found = {name: device.channels for name, device in recorded_devices(session.telemetry_segments).items()}
     for channel, unit in session.units().items():
         device, _, name = channel.removesuffix(f" ({unit})").partition(".")

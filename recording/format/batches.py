@@ -163,8 +163,8 @@ def name_fields(channels: Iterable[Channel]) -> tuple[str, ...]:
 
 
 def name_apart(channel: str, unit: str, first: str) -> str:
-    """What a channel is called in a session in which it was recorded in the unit `first` before: its name, or with
-    another unit `lab.pressure (mbar)`."""
+    """Return what a channel is called in a session in which it was recorded in the unit `first` before: its name, or
+    with another unit `lab.pressure (mbar)`."""
     return channel if unit == first else f"{channel} ({unit})"
 
 

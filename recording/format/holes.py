@@ -37,7 +37,8 @@ class Hole:
         return (self.begin_ns is None or self.begin_ns < time_ns) and (self.end_ns is None or time_ns < self.end_ns)
 
     def clip(self, begin_ns: int, end_ns: int) -> Hole | None:
-        """What of it lies in [begin_ns, end_ns), None when nothing does; how many frames that are is known of all."""
+        """Return what of it lies in [begin_ns, end_ns), None when nothing does; how many frames that are is known of
+        all."""
         first_ns = begin_ns - 1 if self.begin_ns is None else max(self.begin_ns, begin_ns - 1)
         last_ns = end_ns if self.end_ns is None else min(self.end_ns, end_ns)
         if last_ns - first_ns <= 1:

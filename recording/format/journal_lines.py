@@ -50,7 +50,7 @@ def format_lines(texts: Iterable[bytes], mark: bytes, place: int = 0) -> bytes:
 
 
 def parse_lines(data: bytes) -> CheckedLines:
-    """What is sound of a journal, and what is not."""
+    """Return what is sound of a journal, and what is not."""
     *lines, unended = data.split(b"\n")  # what has no end of line is no line
     found = [b""] * len(lines)  # of each line, mark and JSON where it fits its CRC
     ends: list[int] = []
@@ -81,7 +81,7 @@ def format_damage(lines: CheckedLines) -> str:
 
 
 def format_unended(unended_bytes: int) -> str:
-    """What is behind the last end of a line, as the part of a sentence."""
+    """Return what is behind the last end of a line, as the part of a sentence."""
     return f"the last {unended_bytes} bytes are no line: one was being written, or is lost"
 
 

@@ -24,8 +24,8 @@ _FORMAT_DIGITS = 4  # a longer number is no format
 
 
 def explain_unknown_format(session: Mapping[str, str]) -> str:
-    """What is wrong with the format that the record `session` states, in words; "" for one that this version knows, and
-    for a record that is not there."""
+    """Return what is wrong with the format that the record `session` states, in words; "" for one that this version
+    knows, and for a record that is not there."""
     text = session.get("format", "")
     if not session or text == str(FORMAT):
         return ""

@@ -134,7 +134,8 @@ def decompress_chunk(content: memoryview) -> tuple[ChunkHead, memoryview]:
 
 
 def _decompress(data: memoryview, size_bytes: int) -> memoryview:
-    """What zstd has made of so many bytes, in memory that may be written to; ValueError when it is another number."""
+    """Return what zstd has made of so many bytes, in memory that may be written to; ValueError when it is another
+    number."""
     # As much memory is taken as the chunk says: so both have to say the same.
     if zstandard.frame_content_size(data) != size_bytes:
         raise ValueError("a chunk's size is wrong")

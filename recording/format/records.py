@@ -276,8 +276,8 @@ def _check_channels(channels: dict[int, tuple[Channel, str]]) -> dict[int, tuple
 
 
 def find_batch_schema(channel: Channel) -> BatchSchema | None:
-    """How the readings of a device are recorded on a channel, None when it has no readings; ValueError when it does not
-    say it."""
+    """Return how the readings of a device are recorded on a channel, None when it has no readings; ValueError when it
+    does not say it."""
     return parse_batch_schema(channel.metadata) if channel.topic.startswith(READINGS) else None
 
 

@@ -68,7 +68,7 @@ class UtcOffsets:
 
 
 def collect_offsets(events: Iterable[Event]) -> UtcOffsets:
-    """What the events of a session say; one whose data cannot be understood says nothing."""
+    """Return what the events of a session say; one whose data cannot be understood says nothing."""
     steps = sorted(step for event in events if event.kind == CLOCK_STEP and (step := _parse_step(event)) is not None)
     if not steps:
         return UtcOffsets()

@@ -102,7 +102,7 @@ class ListedSession:
 
 
 def make_entry(seen: Scan, contents: str = "") -> ListedSession:
-    """What a list shows of a session that was looked at."""
+    """Return what a list shows of a session that was looked at."""
     from thermostand.recording.reading.run_status import Files
 
     by_operator = read_notes(seen.path)
@@ -231,7 +231,7 @@ class _Index:
                 self._rows = self._read()
 
     def get(self, path: Path, files: str) -> ListedSession | None:
-        """What was entered of these files; None when nothing was."""
+        """Return what was entered of these files; None when nothing was."""
         if self._memory is not None and (seen := self._memory.get(path)) is not None and seen[0] == files:
             return seen[1]
         name = os.fsencode(path.name)
@@ -297,7 +297,7 @@ class _Index:
         }
 
     def _seal(self, name: bytes, files: str, text: str) -> str:
-        """What a row was made by, of which files, and all that it says: the database itself has no checksums."""
+        """Return what a row was made by, of which files, and all that it says: the database itself has no checksums."""
         return _compute_digest((self._version, name, files, text))
 
 

@@ -107,7 +107,7 @@ class ReadingColumns:
             rows.qualities.extend(rows.qualities_of(found))
 
     def _name_channel(self, channel: str, unit: str) -> str:
-        """What a channel is called that is read in this unit."""
+        """Return what a channel is called that is read in this unit."""
         name = name_apart(channel, unit, self.units.setdefault(channel, unit))
         self.units[name] = unit
         return name

@@ -265,7 +265,7 @@ class Scan:
         return NO_TEMPERATURE if self.has_camera_degC is False else ""
 
     def count(self, state: SegmentState) -> int:
-        """How many segments are in that state."""
+        """Return how many segments are in that state."""
         return sum(file.state is state for file in self.inventory)
 
 
@@ -605,7 +605,7 @@ class _SessionScanner:
             yield _make_error(f"{name} is attached, and was not when the run began, by {MANIFEST_NAME}")
 
     def _compare_manifest(self) -> Iterator[SessionFinding]:
-        """What the recorder stated, against what is there."""
+        """Return what the recorder stated, against what is there."""
         stated = self._manifest
         if isinstance(stated, NoManifest):
             remake = "; `stand session repair` makes one of what is there"
@@ -632,7 +632,7 @@ class _SessionScanner:
             yield from _check_journal(self._path, stated, self._journal)
 
     def _compare_listed(self, stated: Manifest, each: ScannedSegment) -> SessionFinding | None:
-        """What `session.json` has against a finished segment that is there."""
+        """Return what `session.json` has against a finished segment that is there."""
         name, known = each.file.name, stated.segments.get(each.file.name)
         if each.damages or dict(each.session) != dict(self._metadata):
             return None  # a finding already
@@ -710,7 +710,7 @@ class _SessionScanner:
         return _LostEnd(hole, why + format_planned_frames(self._find_planned_count(), self._count_frames()))
 
     def _find_planned_count(self) -> int | None:
-        """How many frames the plan has, by the events, else by the manifest; None when neither says."""
+        """Return how many frames the plan has, by the events, else by the manifest; None when neither says."""
         planned = [event.data.get("frames") for event in self._recorded.events if event.kind in TELL_PLAN]
         last = planned[-1] if planned else None
         if not isinstance(last, int) and isinstance(self._manifest, Manifest):
@@ -736,8 +736,8 @@ class _SessionScanner:
         return find_shortages(self._recorded.marks, self._recorded.events, self._recorded.metas)
 
     def _count_not_begun(self) -> int:
-        """How many frames of the plan of a complete run are not there, of whatever step; 0 when an operator has left
-        out one, or something else is missing that may have them."""
+        """Return how many frames of the plan of a complete run are not there, of whatever step; 0 when an operator has
+        left out one, or something else is missing that may have them."""
         is_over = self._run is RunOutcome.COMPLETE and (
             (last := find_last_run_event(self._recorded.events)) is not None and last.kind == RUN_END
         )
@@ -940,8 +940,8 @@ def _join_shortages(one: Shortage, other: Shortage) -> Shortage:
 
 
 def format_planned_frames(planned: int | None, frames: int) -> str:
-    """How many of the frames of the plan `frames` are, as the end of a sentence; "" when the number of planned frames
-    is not known, or when there are as many."""
+    """Return how many of the frames of the plan `frames` are, as the end of a sentence; "" when the number of planned
+    frames is not known, or when there are as many."""
     return f"; {frames} of the {planned} frames of the plan are there" if planned and frames < planned else ""
 
 
@@ -1040,7 +1040,7 @@ def _check_format(session: Mapping[str, str]) -> Iterator[SessionFinding]:
 
 
 def _find_lost_frames(recorded: Recorded, utc: UtcOffsets) -> Iterator[SessionFinding]:
-    """What the recorder, and what camera and wire lost, as recorded."""
+    """Return what the recorder, and what camera and wire lost, as recorded."""
     for event in recorded.events:
         if event.kind == FRAMES_DROPPED:
             yield _make_note(f"{utc.local_text(event.time_ns)}: {event.text}")

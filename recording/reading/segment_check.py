@@ -340,7 +340,7 @@ class _SegmentChecker:
         _check_same(RECORD.pack(Opcode.DATA_END, CRC.size) + CRC.pack(0), data, "the end of the data")
 
     def _compare(self) -> None:
-        """What the whole walk found against the index; ValueError when they differ."""
+        """Compare what the whole walk found with the index; ValueError when they differ."""
         check, index = self._check, self._index
         # Schemas and channels go into the first chunk; a segment without a message has none.
         if index.chunks and (self._schemas, self._channels) != (index.schemas, index.channels):
@@ -373,7 +373,7 @@ class _PlacedMessage(NamedTuple):
 
 
 def _encode_head(head: ChunkHead, entry: ChunkIndex) -> bytes:
-    """What stands before the data of a chunk, by the index where that has it."""
+    """Return what stands before the data of a chunk, by the index where that has it."""
     name = entry.compression.encode()
     times_ns = entry.message_start_time, entry.message_end_time
     return (

@@ -66,7 +66,7 @@ class ChunkContents(NamedTuple):
     places: dict[int, list[tuple[int, int]]]
 
     def indexes(self) -> set[bytes]:
-        """What the message indexes behind the chunk say."""
+        """Return what the message indexes behind the chunk say."""
         return {encode_record(MessageIndex(*each))[RECORD.size :] for each in self.places.items()}
 
 
@@ -78,7 +78,7 @@ class RecordHead(NamedTuple):
 
 
 def parse_record_head(head: bytes) -> RecordHead | None:
-    """What a record's head says it is; None when that is no record of the data section."""
+    """Return what a record's head says it is; None when that is no record of the data section."""
     if len(head) < RECORD.size:
         return None
     opcode, length = RECORD.unpack_from(head)
@@ -94,7 +94,7 @@ OPCODES = {*_EXACT, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT}
 
 
 def check_record(opcode: int, content: bytes) -> ChunkContents | Metadata | Attachment | DataEnd | None:
-    """What the record says; one of DAMAGE when it does not prove itself."""
+    """Return what the record says; one of DAMAGE when it does not prove itself."""
     if opcode == Opcode.CHUNK:
         _, data = decompress_chunk(memoryview(content))
         return _read_chunk_contents(data)

@@ -219,7 +219,7 @@ class Session:
         return np.array([place.time_ns for place in self._iterate_places()], np.int64)
 
     def frames_table(self) -> FramesTable:
-        """What is known of each frame as columns; no image is decoded."""
+        """Return what is known of each frame as columns; no image is decoded."""
         return build_frames_table(self, list(self._iterate_places()))
 
     def to_xarray(self) -> SessionArrays:

@@ -364,7 +364,7 @@ class _Original:
     opening: SegmentOpening | None
 
     def messages(self) -> Iterator[tuple[Channel, StoredMessage]]:
-        """What can be delivered, in order."""
+        """Return what can be delivered, in order."""
         return chain.from_iterable(self.iterate_chunks())
 
     def iterate_chunks(self) -> Iterator[list[tuple[Channel, StoredMessage]]]:
@@ -636,7 +636,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
 
 
 def format_salvaged(salvaged: Salvaged) -> str:
-    """What became of a segment, which is named with its session."""
+    """Return what became of a segment, which is named with its session."""
     source = "/".join(salvaged.source.absolute().parts[-3:])
     if salvaged.reason == BEING_RECORDED:
         return f"{source}: left alone, it is being recorded"

@@ -40,8 +40,8 @@ class DiskCalls:
         self._lane = WorkerThread(f"disk-{line}", clock, patient=False)
 
     async def call(self, function: Callable[..., Any], *args: object) -> Any:
-        """What `function(*args)` returns or raises, which can be pickled; SessionError when the process is gone, and
-        for an OSError."""
+        """Return what `function(*args)` returns or raises, which can be pickled; SessionError when the process is gone,
+        and for an OSError."""
         try:
             if self._line is None:
                 return await self._lane.call(function, *args)

@@ -58,7 +58,7 @@ class WatchedFolder:
         return os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
 
     def _describe_loss(self) -> str:
-        """What has become of the folder, as the kernel knows it."""
+        """Return what has become of the folder, as the kernel knows it."""
         if not os.fstat(self._fd).st_nlink:
             return "was removed while it was recorded into"
         with suppress(OSError):
@@ -127,7 +127,7 @@ class FolderWatch:
         )
 
     def follow(self, name: str, failure: OSError | str | None, kept: FolderContents) -> None:
-        """How the last look at one folder ended: only a FolderLost, or its sentence, is a loss; None ends it."""
+        """Note how the last look at one folder ended: only a FolderLost, or its sentence, is a loss; None ends it."""
         was = self._find_first_loss()
         if isinstance(failure, FolderLost):
             failure = str(failure.strerror)
@@ -177,7 +177,8 @@ class FolderWatch:
         return made_again
 
     def make_loss_event(self, made_again: tuple[str, ...], from_ns: int) -> Event:
-        """What is not in the session's folder any more: all that this run had recorded in what was made again."""
+        """Return what is not in the session's folder any more: all that this run had recorded in what was made
+        again."""
         gone = {name: self._kept[name] for name in made_again if name in self._kept}
         self._kept.clear()
         to_ns = max((kept.until_ns for kept in gone.values()), default=from_ns)

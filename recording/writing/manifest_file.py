@@ -55,7 +55,7 @@ class ManifestFile:
         self._write()
 
     def plan(self, size: Mapping[str, int]) -> None:
-        """How many `steps` and `frames` the plan has from now on."""
+        """State how many `steps` and `frames` the plan has from now on."""
         with self._changing:
             self._manifest, self._is_new = replace(self._manifest, plan=dict(size)), True
         self._write()

@@ -222,7 +222,7 @@ class SessionSeries:
         return SeriesReply(result, failure, series.is_open, _drain(series.troubles))
 
     def plan(self, size: Mapping[str, int]) -> None:
-        """How many `steps` and `frames` the plan has."""
+        """State how many `steps` and `frames` the plan has."""
         self._manifest.plan(size)
 
     def end(self) -> None:

@@ -32,7 +32,7 @@ class SessionSpec:
     settings: RecordingSettings
 
     def make_manifest(self) -> Manifest:
-        """What is known of the session when it begins."""
+        """Return what is known of the session when it begins."""
         texts = {name: hash_text(text) for name, text in self.attachments.items()}
         devices = {name: describe_device(name, kind) for name, kind in self.devices.items()}
         return Manifest(dict(self.metadata), devices, texts)
@@ -71,8 +71,8 @@ class SessionSpec:
 
 
 def describe_device(device: str, recorded: RecordedDevice) -> dict[str, object]:
-    """What the manifest says of a device: its kind, its channels, each with its unit, and whether it is opened with the
-    stand."""
+    """Return what the manifest says of a device: its kind, its channels, each with its unit, and whether it is opened
+    with the stand."""
     channels = {f"{device}.{each.name}": each.unit for each in recorded.channels}
     return {"kind": recorded.kind, "channels": channels, "is_opened": recorded.is_opened}
 

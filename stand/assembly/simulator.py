@@ -249,7 +249,7 @@ class ControlSocket:
 
 
 def _parse_answer(line: bytes) -> dict[str, object]:
-    """What the simulator answered; Refused when it refuses."""
+    """Return what the simulator answered; Refused when it refuses."""
     answer: dict[str, object] = json.loads(line)
     if "error" in answer:
         raise Refused("simulator", str(answer["error"]))

@@ -87,8 +87,8 @@ class _StoredState(BaseModel):
 
 
 def load_state(path: Path | None, now_ns: int, boot: Boot | None) -> CompressorState:
-    """What `path` keeps, for a compressor that is off now. When it was switched off is unknown, and so taken for just
-    now, when the file is missing or damaged, is of another boot, ends with a running compressor, or has times in
+    """Return what `path` keeps, for a compressor that is off now. When it was switched off is unknown, and so taken for
+    just now, when the file is missing or damaged, is of another boot, ends with a running compressor, or has times in
     the future. Starts of another boot are forgotten."""
     unknown = CompressorState(running=False, since_ns=now_ns)
     if path is None:

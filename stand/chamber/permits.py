@@ -226,7 +226,7 @@ class Permits:
         return None if is_late else (on, off, held_s)
 
     def _compare(self, coils: dict[str, bool]) -> None:
-        """What has dropped though its time was not over."""
+        """Report what has dropped though its time was not over."""
         now_ns = self._clock.now_ns()
         for channel in (HEATER, COMPRESSOR):
             until_ns = self._until_ns.get(channel, 0)

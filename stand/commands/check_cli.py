@@ -72,7 +72,7 @@ def check(
 
 
 def _rehearse(file: Path, stand: StandConfig | None) -> None:
-    """What of a GenICam file would be used."""
+    """Rehearse a GenICam file: print what of it would be used."""
     found = asyncio.run(rehearse(file, stand))
     lines = [found.camera or str(file), *(f"  {purpose:<14}{name or '-'}" for purpose, name in found.features.items())]
     if found.refusal:

@@ -130,7 +130,7 @@ def reset(
 
 
 def _wait_for_renewed_fault(server: Server) -> FaultState | None:
-    """What the guard, or a step that is done again, has met within a moment of a reset."""
+    """Return what the guard, or a step that is done again, has met within a moment of a reset."""
     for _ in range(round(_AGAIN_S / _LOOK_S)):
         if (fault := server.state().fault) is not None:
             return fault
@@ -139,7 +139,7 @@ def _wait_for_renewed_fault(server: Server) -> FaultState | None:
 
 
 def _read_latch(config: str) -> LatchedFault | None:
-    """What an earlier run or daemon has left latched of the stand, which no program has."""
+    """Return what an earlier run or daemon has left latched of the stand, which no program has."""
     from thermostand.stand.config.stand_config import find_packaged, load_config
     from thermostand.stand.running.opening.stand_lock import find_latch_file
 
@@ -187,7 +187,7 @@ def _show(server: Server, state: StandState) -> None:
 
 
 def _describe_endings(state: StandState) -> Iterator[str]:
-    """What ends what holds the stand."""
+    """Return what ends what holds the stand."""
     if state.fault is not None:
         ended = {} if state.run is not None else {"action": "hold"}  # a run that has tripped is over: to be reset
         yield get_next_command(f"guard.{state.fault.rule}", {**state.fault.data, **ended})
@@ -233,7 +233,7 @@ def format_idle_lines(name: str, state: StandState) -> Iterator[str]:
 
 
 def _further_lines(state: StandState) -> Iterator[str]:
-    """What is read besides temperatures, flags and counts, each in its unit."""
+    """Return what is read besides temperatures, flags and counts, each in its unit."""
     for channel, reading in state.readings.items():
         if reading.unit not in ("degC", "1"):
             known = f"no reading: {reading.reason}" if reading.value is None else f"{reading.value:.6g} {reading.unit}"

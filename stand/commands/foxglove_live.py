@@ -49,7 +49,7 @@ class FoxgloveServer:
         self._server.stop()
 
     def state(self, state: StandState) -> None:
-        """What was read since the last state, and the state itself."""
+        """Publish what was read since the last state, and the state itself."""
         self._utc_offset_ns = state.utc_offset_ns
         devices: dict[str, dict[str, float | None]] = {}
         for channel, reading in state.readings.items():

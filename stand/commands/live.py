@@ -87,7 +87,7 @@ _BAR = 24
 
 
 def format_panel(moment: StatusSnapshot) -> list[str]:
-    """What stands in the panel, a line for each question: what, how warm, what has been seen, how long."""
+    """Return what stands in the panel, a line for each question: what, how warm, what has been seen, how long."""
     lines = [
         _format_step(moment),
         "   ".join(_format_temperatures(moment)),

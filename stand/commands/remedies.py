@@ -24,7 +24,7 @@ _ACTIONS = ({"action": "abort"}, {"action": "hold"}, {"action": "hold", "ends_it
 
 
 def get_next_command(kind: str, data: Mapping[str, object], session: str = "") -> str:
-    """What helps, or shows more, after a warning or an error of that kind. session: the folder of the run's."""
+    """Return what helps, or shows more, after a warning or an error of that kind. session: the folder of the run's."""
     return get_advice(kind, data, session)
 
 

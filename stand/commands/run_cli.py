@@ -203,7 +203,7 @@ def _resume_remotely(server: Server, directory: Path, *, attended: bool, report:
 
 
 def _finish(session: Path, config: StandConfig, *, report: bool) -> None:
-    """What follows a complete run: the next plan's durations, its folder printed, its report."""
+    """Do what follows a complete run: learn the next plan's durations, print its folder, make its report."""
     try:
         learn_durations(session.parent, config)
     except (SessionError, OSError) as error:  # what cannot be kept is no reason for a run to fail

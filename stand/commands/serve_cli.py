@@ -40,7 +40,8 @@ Tell = Callable[[Event], None]
 
 
 class TokenReloader:
-    """Reloads tokens from `begin` on; to be used on the control loop. path: of the tokens, None where no file is named."""
+    """Reloads tokens from `begin` on; to be used on the control loop. path: of the tokens, None where no file is
+    named."""
 
     def __init__(self, path: Path | None, book: TokenStore, now_ns: Callable[[], int], tell: Tell) -> None:
         self._path, self._book = path, book
@@ -150,7 +151,7 @@ def serve(
 
 
 def _collect_attachments(path: Path, stand: StandConfig) -> dict[str, str]:
-    """What each session of this stand keeps, by the attachment's name; a stand that was not checked since is
+    """Return what each session of this stand keeps, by the attachment's name; a stand that was not checked since is
     reported."""
     texts = {"config.yaml": read_document(path), "target.yaml": read_document(find_packaged("targets", stand.target))}
     texts |= read_optics_texts(stand)

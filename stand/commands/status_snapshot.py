@@ -40,7 +40,7 @@ class RemoteStand:
         return cast("list[EventData]", answer.get("events", []))
 
     def take_snapshot(self, state: StandState) -> StatusSnapshot:
-        """What is shown of a state."""
+        """Return what is shown of a state."""
         self._note_session(state)
         return make_snapshot(state, None if state.run is None else self._fetch_drift_px())
 

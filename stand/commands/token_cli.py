@@ -101,7 +101,8 @@ def login(
 
 
 def _print_activation(what: str) -> None:
-    """How a daemon learns of it. No signal is sent from here: for `stand run`, which reads them once, it is an end."""
+    """Print how a daemon learns of it. No signal is sent from here: for `stand run`, which reads them once, it is an
+    end."""
     say(f"a running `stand serve` {what} at SIGHUP (`systemctl reload` of its unit, or kill -HUP), or its next start")
 
 

@@ -36,7 +36,7 @@ def make_app(service: type[Served], group: str = "", help_text: str | None = Non
 
 
 def ask(server: Server, command: Command, **given: object) -> Answer:
-    """What a stand answers to a command with these fields of its argument. SessionError as Server.request."""
+    """Return what a stand answers to a command with these fields of its argument. SessionError as Server.request."""
     if command.name == STOP:
         return server.order(STOP)  # which has a way of its own
     path = command.path.format(**{name: quote(str(given.pop(name)), safe="") for name in command.in_path})
@@ -49,7 +49,7 @@ def order(server: Server, name: str, **given: object) -> Answer:
 
 
 def make_recipe_request(recipe: str) -> dict[str, object]:
-    """What asks for a recipe: a file's as it is now, or an installed one."""
+    """Return what asks for a recipe: a file's as it is now, or an installed one."""
     typed = _get_typed("recipe", _list_fields(COMMANDS["submit"])["recipe"])
     return dict([_get_field("recipe", typed, recipe)])
 
@@ -109,7 +109,7 @@ def _get_field(name: str, typed: Typed, value: object) -> tuple[str, object]:
 
 
 def _make_option(info: FieldInfo, typed: Typed) -> tuple[Any, object]:
-    """How typer sees a field: what is required is an argument, all else an option."""
+    """Return how typer sees a field: what is required is an argument, all else an option."""
     help_text = typed.help or info.description or ""
     kind: Any = info.annotation
     if typed.value is not None or kind is bool:

@@ -77,8 +77,8 @@ async def _list_unsupported_features(simulator: Simulator) -> tuple[str, ...]:
 
 
 def _explain_unsupported(error: DeviceError, unplayed: tuple[str, ...]) -> str:
-    """Why what went wrong is the rehearsal's own, "" when it is the file's. A simulated camera that is understood
-    always gives frames, and takes what its registers can hold."""
+    """Return why what went wrong is the rehearsal's own, "" when it is the file's. A simulated camera that is
+    understood always gives frames, and takes what its registers can hold."""
     missed = [name for name in unplayed if name in _SET_BY]
     if not missed and not isinstance(error, Unreachable):
         return ""

@@ -53,8 +53,8 @@ def load_check_record(config: Path) -> CheckRecord | None:
 
 
 def explain_unchecked(config: Path, record: CheckRecord | None, texts: Mapping[str, str], *, is_simulated: bool) -> str:
-    """Why a stand should be checked before it is relied upon, as a sentence; "" when it need not be. texts: its file
-    and register maps as they are now, by the names under which sessions have them."""
+    """Return why a stand should be checked before it is relied upon, as a sentence; "" when it need not be. texts: its
+    file and register maps as they are now, by the names under which sessions have them."""
     again = f"`stand check --config {config}`"
     if record is None:
         return "" if is_simulated else f"{config} was never checked on this stand; {again} does it"

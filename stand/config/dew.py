@@ -42,8 +42,8 @@ class DewConfig(Document):
         return self
 
     def lowest_degC(self, laboratory_degC: float, measured_degC: float = math.nan) -> float:
-        """What nothing may be below that meets the laboratory's air at that temperature and, where it is measured, with
-        that dew point; NaN while neither is known."""
+        """Return what nothing may be below that meets the laboratory's air at that temperature and, where it is
+        measured, with that dew point; NaN while neither is known."""
         if not math.isnan(measured_degC):
             return measured_degC + self.margin_K
         if self.dew_point_degC is not None:

@@ -188,7 +188,7 @@ class StandConfig(Document):
         return self
 
     def _find_faults(self) -> Iterator[str]:
-        """What of one section does not fit another."""
+        """Return what of one section does not fit another."""
         yield from _find_role_faults(self.thermometers)
         yield from self._find_control_faults()
         yield from self._find_device_faults()

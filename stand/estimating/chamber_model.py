@@ -45,8 +45,8 @@ class Response(Document):
     time_constant_s: float = Field(gt=0)
 
     def arrival_s(self, gap_K: float, level_K: float = BAND_K) -> float:
-        """How long from the step of the set-point until the air is within `level_K` of it, s; 0 when it is from the
-        start."""
+        """Return how long from the step of the set-point until the air is within `level_K` of it, s; 0 when it is from
+        the start."""
         gap_K = abs(gap_K)
         if gap_K <= level_K:
             return 0.0
@@ -72,12 +72,13 @@ class ChamberModel(Document):
     camera_ramps: int = Field(default=0, ge=0)
 
     def arrival_s(self, from_degC: float, to_degC: float, level_K: float = BAND_K) -> float:
-        """How long from the step of the set-point until the air is within `level_K` of it, s."""
+        """Return how long from the step of the set-point until the air is within `level_K` of it, s."""
         response = self.heating if to_degC > from_degC else self.cooling
         return response.arrival_s(to_degC - from_degC, level_K)
 
     def settled_s(self, from_degC: float, to_degC: float) -> float:
-        """How long until the camera has followed for two time constants after that, s; 0 when the air need not move."""
+        """Return how long until the camera has followed for two time constants after that, s; 0 when the air need not
+        move."""
         arrival_s = self.arrival_s(from_degC, to_degC)
         return arrival_s + 2.0 * self.camera_time_constant_s if arrival_s > 0.0 else 0.0
 
@@ -178,7 +179,7 @@ def _fit_response(ramps: Sequence[Ramp], default: Response) -> Response:
 
 
 def _extract_ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC: float) -> Ramp | None:
-    """What the air (rows: s since the step, degC) shows; None when the step was small or it did not arrive."""
+    """Return what the air (rows: s since the step, degC) shows; None when the step was small or it did not arrive."""
     if pv.shape[1] < 2:
         return None
     from_degC = float(pv[1, 0])

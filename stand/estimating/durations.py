@@ -73,13 +73,13 @@ class ConfiguredStand(KnownStand):
         return ""
 
     def camera_fault(self) -> str:
-        """Why no frames can be taken; "" when there is a camera."""
+        """Return why no frames can be taken; "" when there is a camera."""
         if self._config.cameras:
             return ""
         return "needs a camera, and this stand has none; name it under cameras in the stand's file"
 
     def supply_fault(self) -> str:
-        """Why cameras cannot be switched off; "" when relays can do it."""
+        """Return why cameras cannot be switched off; "" when relays can do it."""
         if self._config.relays is not None:
             return ""
         return "no relay switches the cameras, which stay on: this stand has no relay board; leave it out"
@@ -135,6 +135,6 @@ class ConfiguredStand(KnownStand):
 def price_step(
     step: Step, found: Situation, stand: KnownStand, overheads_s: Mapping[str, float] = MappingProxyType({})
 ) -> Price:
-    """What the step takes in the situation it finds; `overheads_s` was learned, by kind of work."""
+    """Return what the step takes in the situation it finds; `overheads_s` was learned, by kind of work."""
     usual = step.price(found, stand)
     return replace(usual, overhead_s=overheads_s.get(usual.work, usual.overhead_s))

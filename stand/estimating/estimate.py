@@ -132,8 +132,8 @@ def price_plan(
 
 
 def estimate_return_s(plan: Iterable[PlannedStep], config: StandConfig, learned: LearnedDurations) -> float:
-    """How long the chamber, and a camera that is cold, take back to the laboratory's temperature when the plan is done,
-    s; 0 on a stand that does not bring it back, or of a plan that ends there."""
+    """Return how long the chamber, and a camera that is cold, take back to the laboratory's temperature when the plan
+    is done, s; 0 on a stand that does not bring it back, or of a plan that ends there."""
     ending, last_degC = config.ending, config.ending.ambient_degC
     for planned in plan:
         if isinstance(planned.step, StartChamber | SetTemperature):
@@ -219,7 +219,8 @@ def _estimate_messages_per_s(config: StandConfig) -> float:
 
 
 def _estimate_bytes_per_px(step: Step, frames: int, config: StandConfig) -> float:
-    """What all frames of a step take, per pixel of one; with `roi` a step's first frame is whole, then one at times."""
+    """Return what all frames of a step take, per pixel of one; with `roi` a step's first frame is whole, then one at
+    times."""
     recording, whole = config.recording, 0
     if isinstance(step, Capture | SoakUntilSettled) and recording.frame_encoding == "roi" and frames:
         interval_s = step.interval_s if isinstance(step, Capture) else step.look_every_s

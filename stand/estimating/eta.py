@@ -89,7 +89,7 @@ class Eta:
         return sum(step.frames for step in self._steps)
 
     def expected_s(self, step_id: str) -> float:
-        """What a step of the plan is expected to take, or was, from its beginning to its end, s."""
+        """Return what a step of the plan is expected to take, or was, from its beginning to its end, s."""
         return self._expected_s[step_id]
 
     def ends_s(self, now_ns: int) -> dict[str, float]:
@@ -106,9 +106,9 @@ class Eta:
         return ends
 
     def within_s(self) -> float | None:
-        """How much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
-        expected of each, for as many of their kind of work as are to come; no less than a minute. None before three
-        are done, while the kinds that are still to take half of the time have not been seen, and when none is left."""
+        """Return how much the plan may end earlier or later, s: twice the deviation of the steps so far from what was
+        expected of each, for as many of their kind of work as are to come; no less than a minute. None before three are
+        done, while the kinds that are still to take half of the time have not been seen, and when none is left."""
         left = self._count + Counter(() if self._running is None else (self._running.work,))
         if sum(map(len, self._off_s.values())) < _LEAST_SEEN or not left.total():
             return None
@@ -178,7 +178,7 @@ class Eta:
                 self._running = self._steps[index] if isinstance(by_s, int | float) else None
 
     def _from_now_s(self, step: PricedStep) -> float:
-        """What a step that begins now is expected to take."""
+        """Return what a step that begins now is expected to take."""
         return step.stated_s + self._overhead_s[step.work]
 
     def _wait_for(self, index: int) -> None:

@@ -50,7 +50,7 @@ class LearnedDurations(Document):
 
 
 def load_learned_durations(directory: Path) -> LearnedDurations:
-    """What is kept in `directory`; defaults when there is nothing or nothing that can be read: an estimate is no
+    """Return what is kept in `directory`; defaults when there is nothing or nothing that can be read: an estimate is no
     reason not to run, and the file is rewritten at the end of each."""
     try:
         return LearnedDurations.model_validate_json(unseal(_KIND, (directory / LEARNED_FILE).read_bytes()))
@@ -122,7 +122,7 @@ def _iterate_sessions(directory: Path, config: StandConfig) -> Iterator[_Session
 
 
 def _read_session(path: Path, stand: str) -> _SessionDurations | None:
-    """What the session teaches; None when it is another stand's, or cannot be read for any reason: a neighbour
+    """Return what the session teaches; None when it is another stand's, or cannot be read for any reason: a neighbour
     in the folder never ends a run."""
     try:
         session = Session.open(path)

@@ -39,7 +39,7 @@ def find_existing(directory: Path) -> Path:
 
 
 def explain_small_disk(directory: Path, steps: Iterable[PricedStep], config: StandConfig) -> str:
-    """Why the disk has too little space for a run, which would stop half-way; "" when there is enough."""
+    """Return why the disk has too little space for a run, which would stop half-way; "" when there is enough."""
     free_bytes = shutil.disk_usage(find_existing(directory)).free
     plan_GB, least_GB = sum(step.size_bytes for step in steps) / 1e9, config.recording.stop_frames_below_GB
     if free_bytes / 1e9 >= plan_GB + least_GB:

@@ -137,8 +137,8 @@ class ChannelCheck:
         self._jumped_ns: dict[str, int] = {}
 
     def make_marker(self, module: str) -> Callable[[Poll, int], Poll]:
-        """What is to be published of each poll of a device, which is called `module` where several of its channels move
-        at once."""
+        """Return what is to be published of each poll of a device, which is called `module` where several of its
+        channels move at once."""
 
         def mark(readings: Poll, now_ns: int) -> Poll:
             known = [each for each in readings if each.channel in self._natures]
@@ -155,7 +155,7 @@ class ChannelCheck:
         return mark
 
     def judge_value(self, channel: str, value: float, time_ns: int) -> str:
-        """Why one more reading of the channel, which came with a frame, is not to be believed; "" when it is."""
+        """Return why one more reading of the channel, which came with a frame, is not to be believed; "" when it is."""
         if channel not in self._natures or math.isnan(value):
             return ""
         self._report(self._judge(channel, value, time_ns, math.inf, is_poll=False), channel, [channel], time_ns)
@@ -217,8 +217,8 @@ class ChannelCheck:
         return math.nan if other is None or other.suspicion is not None else other.value
 
     def _allowed_K(self, seen: _ChannelState, nature: ChannelModel, time_ns: int) -> float:
-        """How far one reading may be from where the last ones lead: a step of the display, what a longer gap leaves
-        space for, and as far as its surroundings have gone while it stood still."""
+        """Return how far one reading may be from where the last ones lead: a step of the display, what a longer gap
+        leaves space for, and as far as its surroundings have gone while it stood still."""
         gap_s = max(0.0, (time_ns - seen.time_ns) / NS_PER_S - _JUMP_WITHIN_S)
         still_s = (time_ns - seen.changed_ns) / NS_PER_S
         went_K = max(0.0, seen.followed_degC[1] - seen.followed_degC[0]) * _compute_share(still_s, nature.lag_s)
@@ -270,7 +270,7 @@ class ChannelCheck:
             seen.suspicion = None
 
     def _judge_lasting(self, channel: str, seen: _ChannelState, nature: ChannelModel, fine_K: float) -> None:
-        """What is wrong for as long as it lasts; a jump stays one."""
+        """Judge what is wrong for as long as it lasts; a jump stays one."""
         found = (
             self._check_range(channel, seen, nature)
             or self._check_noise(channel, seen)
@@ -408,7 +408,7 @@ def _compute_share(time_s: float, lag_s: float) -> float:
 
 
 def _compute_own_heat_K(seen: _ChannelState, nature: ChannelModel, from_ns: int, to_ns: int) -> float:
-    """How far its own heat may have moved it, which it has since its begin; before that it may have been off."""
+    """Return how far its own heat may have moved it, which it has since its begin; before that it may have been off."""
     if nature.excess_K is None:
         return 0.0
     off_s = max(0, seen.begin_ns - from_ns) / NS_PER_S
@@ -423,7 +423,7 @@ def _get_step_K(seen: _ChannelState) -> float:
 
 
 def _measure_beyond_K(seen: _ChannelState, value: float, time_ns: int) -> float:
-    """How far a reading is outside of what lies between the last one and where the trend leads, K."""
+    """Return how far a reading is outside of what lies between the last one and where the trend leads, K."""
     ahead_K, (least_s, most_s) = 0.0, _TREND_S
     spans = [each for each in seen.recent if least_s <= (seen.time_ns - each[0]) / NS_PER_S <= most_s]
     if spans:

@@ -25,7 +25,8 @@ _FALL_K = 4.0  # from its highest; good sessions fall by 1.5 K, when a ramp pass
 
 
 def compute_heat_percent(readings: Readings, regulator: str, permit: str) -> float:
-    """What of the heater's power is given, %: none only where it is known that the permit is off; 0 when unknown."""
+    """Return what of the heater's power is given, %: none only where it is known that the permit is off; 0 when
+    unknown."""
     output = get_value(readings, f"{regulator}.mv_heat")
     return 0.0 if math.isnan(output) or get_value(readings, permit) == 0 else output
 

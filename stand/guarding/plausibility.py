@@ -32,7 +32,7 @@ WarmAround = Callable[[Readings, int], tuple[float, ...]]  # degC at an instant,
 
 
 def read_channels(*channels: str) -> WarmAround:
-    """What these channels read."""
+    """Return what these channels read."""
     return lambda readings, now_ns: tuple(get_value(readings, channel) for channel in channels)
 
 

@@ -254,7 +254,7 @@ def make_watches(config: StandConfig, announced: Announcements) -> tuple[Watch, 
 
 
 def _watch_temperatures(config: StandConfig) -> tuple[Watch, ...]:
-    """What must never be, at once. The camera's own temperature is limited but not required: it is off before a
+    """Return what must never be, at once. The camera's own temperature is limited but not required: it is off before a
     warm-up."""
     limits = config.guard
     return (
@@ -300,7 +300,7 @@ def _watch_heat(config: StandConfig, seen: SensorHistory) -> tuple[Watch, ...]:
 
 
 def make_sensor_history(config: StandConfig) -> SensorHistory:
-    """What shows which of two channels moved unlike the rest."""
+    """Return what shows which of two channels moved unlike the rest."""
     chamber = config.chamber
     bodies = dict.fromkeys(list_granite_channels(config), chamber.granite_lag_s)
     cameras = {f"{name}.temperature": chamber.camera_lag_s for name in config.cameras}
@@ -380,7 +380,7 @@ def _watch_independent_evidence(config: StandConfig, seen: SensorHistory) -> tup
 
 
 def _make_surroundings(config: StandConfig) -> WarmAround:
-    """What could warm the air."""
+    """Return what could warm the air."""
     found = read_channels(*((LABORATORY,) if "laboratory" in config.sensors else ()), *list_granite_channels(config))
     if list_granite_channels(config):
         return found
@@ -447,8 +447,8 @@ def _watch_flap(config: StandConfig, announced: Announcements) -> tuple[Watch, .
 
 
 def list_cold_parts(config: StandConfig) -> tuple[str, ...]:
-    """What water would settle on first, as far as it is measured: the target, or the granite it stands on, and the
-    cameras."""
+    """Return what water would settle on first, as far as it is measured: the target, or the granite it stands on, and
+    the cameras."""
     target = ("thermometers.artifact",) if "artifact" in config.sensors else list_granite_channels(config)
     return (*target, *(f"{name}.temperature" for name in config.cameras))
 
@@ -464,8 +464,8 @@ def _watch_dew(config: StandConfig) -> tuple[Watch, ...]:
 
 
 def compute_dew_limit_degC(config: StandConfig, readings: Readings) -> float:
-    """What nothing may be below that meets the laboratory's air; NaN while that is unknown, or on a stand that is not
-    asked to look."""
+    """Return what nothing may be below that meets the laboratory's air; NaN while that is unknown, or on a stand that
+    is not asked to look."""
     if config.dew is None:
         return math.nan
     probe, measured_degC = config.dew.hygrometer, math.nan

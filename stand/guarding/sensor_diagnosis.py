@@ -157,8 +157,8 @@ class SensorHistory:
         return pair[wrong_K.index(worse)]
 
     def _compute_lag_error_K(self, air: str, body: str, begin: int) -> tuple[float, float]:
-        """How far the body is from where air as that channel shows it would have brought it, in K of the air; and the
-        share of a step that it follows since `begin`."""
+        """Return how far the body is from where air as that channel shows it would have brought it, in K of the air;
+        and the share of a step that it follows since `begin`."""
         times_s, aired, bodied, lag_s = self._times_s, self._values[air], self._values[body], self._bodies[body]
         trend_K_s = _fit_trend(
             [

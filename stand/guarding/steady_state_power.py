@@ -44,7 +44,8 @@ class PowerState:
 
 
 def find_nearest(learned: Mapping[RestState, float], rest: RestState) -> float | None:
-    """What was needed at the nearest set-point with the compressor alike; None where nothing near was learned."""
+    """Return what was needed at the nearest set-point with the compressor alike; None where nothing near was
+    learned."""
     found = [
         (abs(other.set_point_degC - rest.set_point_degC), percent)
         for other, percent in learned.items()

@@ -51,8 +51,8 @@ class AirEstimate:
     uncertain_K: float = 0.0
 
     def excess_K(self, limit_K: float, share: float) -> float:
-        """How far the estimated air is above all that is allowed: limit_K, and that share of how far probe and body
-        are apart; below 0 all is well. A probe that rises fast has a lag of its own, and is neither stuck nor
+        """Return how far the estimated air is above all that is allowed: limit_K, and that share of how far probe and
+        body are apart; below 0 all is well. A probe that rises fast has a lag of its own, and is neither stuck nor
         outside."""
         apart_K = abs(self.probe_degC - self.body_degC)
         allowed_K = limit_K + share * apart_K + max(0.0, self.probe_risen_K) + self.uncertain_K
@@ -60,8 +60,8 @@ class AirEstimate:
 
 
 def estimate_air(looks: Sequence[CrosscheckSample], window_s: float, lag_s: float) -> AirEstimate | None:
-    """What a window says of the air around a body of that lag; None before it is full. One wild value of the body
-    changes nothing: medians of three."""
+    """Return what a window says of the air around a body of that lag; None before it is full. One wild value of the
+    body changes nothing: medians of three."""
     if len(looks) < 5 or looks[-1].time_ns - looks[0].time_ns < 0.9 * to_ns(window_s):
         return None
     read_degC = [look.body_degC for look in looks]
@@ -103,7 +103,7 @@ class GraniteState:
     lately_apart_K: float = 0.0
 
     def update(self, looks: tuple[CrosscheckSample, ...], found: AirEstimate) -> GraniteState:
-        """What was lately, with one more window in it."""
+        """Return what was lately, with one more window in it."""
         above_K, apart_K = found.air_degC - found.probe_degC, found.probe_degC - found.body_degC
         if self.lately_K is None or not self.looks:
             return GraniteState(looks, above_K, apart_K)
@@ -112,8 +112,8 @@ class GraniteState:
         return GraniteState(looks, lately_K, self.lately_apart_K + share * (apart_K - self.lately_apart_K))
 
     def compute_change_K(self, found: AirEstimate, limits: GraniteCrosscheckConfig) -> float:
-        """How far the estimated air has gone from the probe lately, beyond what is allowed. The error of the lag has
-        been there before, and so does not count."""
+        """Return how far the estimated air has gone from the probe lately, beyond what is allowed. The error of the lag
+        has been there before, and so does not count."""
         if self.lately_K is None:
             return -math.inf
         apart_K = abs(found.probe_degC - found.body_degC - self.lately_apart_K)

@@ -120,8 +120,8 @@ class CameraSupply:
         await self._cameras.close(self._relays.switch(CAMERA_POWER, on=False))
 
     def compare(self, coils: Mapping[str, bool]) -> None:
-        """What the relays read, by channel: a supply that is off though it was switched on has lost the camera's
-        equilibrium; event `camera_supply_off`."""
+        """Compare what the relays read, by channel: a supply that is off though it was switched on has lost the
+        camera's equilibrium; event `camera_supply_off`."""
         if self.is_on and not coils.get(CAMERA_POWER, True):
             self.is_on = False
             off = CAMERA_SUPPLY_OFF.at(self._clock.now_ns())
@@ -157,7 +157,8 @@ class CameraSupply:
             await relays.switch(CAMERA_POWER, on=True)
 
     def _explain_relay(self) -> str:
-        """What to look at when the camera does not answer though its relay was switched on: it may be another one."""
+        """Return what to look at when the camera does not answer though its relay was switched on: it may be another
+        one."""
         channels = self._limits.channels
         others = ", ".join(f"{name} is {number}" for name, number in channels.items() if name != CAMERA_POWER)
         number = f" (number {channels[CAMERA_POWER]}; {others})" if CAMERA_POWER in channels else ""

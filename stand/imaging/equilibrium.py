@@ -73,7 +73,7 @@ class CameraEquilibrium:
         self.is_lost = False
 
     def soaked_s(self) -> float | None:
-        """How long the camera has been soaked since its equilibrium was lost; None when it need not be."""
+        """Return how long the camera has been soaked since its equilibrium was lost; None when it need not be."""
         return (self._clock.now_ns() - self._since_ns) / NS_PER_S if self.is_lost else None
 
     async def wait_until_regained(self, is_disturbed: Callable[[], bool]) -> None:
@@ -100,8 +100,8 @@ class CameraEquilibrium:
         return rate_K_per_min < self._limits.rate_K_per_min
 
     def _rate_K_per_min(self, now_ns: int) -> float:
-        """How fast the camera's temperature may have moved within the last `duration_s`; NaN when it was not known
-        throughout."""
+        """Return how fast the camera's temperature may have moved within the last `duration_s`; NaN when it was not
+        known throughout."""
         end_s, length_s = to_seconds(now_ns), self._limits.duration_s
         if to_seconds(self._since_ns) > end_s - length_s:
             return math.nan

@@ -152,8 +152,9 @@ def fit_drift_rate(time_s: Float, moved_px: Float, uncertainty_px: Float) -> Rat
 
 
 def measure_movement(before: Detection, now: Detection) -> tuple[Float, float] | None:
-    """How the image has moved since `before`, px: along I and J, and by growing and turning, those two as the RMS over
-    the markers; and the standard uncertainty of the position `now`. None when too few markers are seen in both.
+    """Return how the image has moved since `before`, px: along I and J, and by growing and turning, those two as the
+    RMS over the markers; and the standard uncertainty of the position `now`. None when too few markers are seen in
+    both.
 
     A shift alone would miss a focal length that is still on its way.
     """

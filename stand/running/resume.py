@@ -236,17 +236,17 @@ class Interruption:
 
 
 def repair_session(directory: Path) -> tuple[Salvaged, ...]:
-    """What `load_interruption` would have to write: the journal's partial last line is cut off, unfinished segments are
-    finished.
-    SessionError as there. For the process that touches the disk; those that are being recorded are not among them."""
+    """Return what `load_interruption` would have to write: the journal's partial last line is cut off, unfinished
+    segments are finished. SessionError as there. For the process that touches the disk; those that are being recorded
+    are not among them."""
     Journal.open(directory)[0].release()
     found = salvage_unfinished(directory.resolve().parent)
     return tuple(segment for segment in found if segment.reason != BEING_RECORDED)
 
 
 def load_interruption(directory: Path, own: StandConfig | None = None, *, reset: bool = False) -> Interruption:
-    """What is needed to resume the run recorded in `directory` on this stand, the installed simulated one when no
-    `own` is given; its unfinished segments are salvaged.
+    """Return what is needed to resume the run recorded in `directory` on this stand, the installed simulated one when
+    no `own` is given; its unfinished segments are salvaged.
 
     ConfigError when only one of the two stands is simulated. SessionError when a daemon is running it, it is complete,
     it tripped and `reset` is not given, or journal, recording and this version of the program do not belong together.
@@ -386,7 +386,8 @@ def _read_begin(session: Session) -> Begun:
 
 
 def _load_order(session: Session, first: Begun) -> Order:
-    """What was to be run, from the texts in the session; SessionError when they are not those the run began with."""
+    """Return what was to be run, from the texts in the session; SessionError when they are not those the run began
+    with."""
     texts = dict(session.attachments)
     if _hash_texts(texts) != first.texts:
         raise SessionError(f"{session.path}: the attached files are not those its run began with")

@@ -119,8 +119,8 @@ def _compute_ambient_degC(hub: Hub, config: StandConfig) -> float:
 
 
 def _describe_not_ambient(hub: Hub, config: StandConfig) -> str:
-    """What has not reached the laboratory's temperature yet, in words; "" when all has. Air that
-    cannot be read may be anywhere: the guard ends that; other parts that cannot be read are not waited for."""
+    """Return what has not reached the laboratory's temperature yet, in words; "" when all has. Air that cannot be read
+    may be anywhere: the guard ends that; other parts that cannot be read are not waited for."""
     ambient_degC, band_K = _compute_ambient_degC(hub, config), config.ending.band_K
     air_degC = get_value(hub, AIR)
     if not abs(air_degC - ambient_degC) <= band_K:
@@ -372,7 +372,7 @@ def _judge_camera(before: Interruption, assembly: Assembly) -> None:
 
 
 def _make_end(fault: Fault | None, error: BaseException) -> Ended:
-    """How a run ended that did not come to its end."""
+    """Return how a run ended that did not come to its end."""
     if fault is None:
         cause = find_cause(error)
         if isinstance(cause, NotReset):

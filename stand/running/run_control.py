@@ -97,7 +97,7 @@ def resolve_steps(
 
 
 def check_edit(state: RunState, from_index: int, steps: Sequence[WrittenStep], config: StandConfig) -> PlanCheck:
-    """What an edit of the plan from `from_index` on would say. Changes nothing, and asks no device."""
+    """Return what an edit of the plan from `from_index` on would say. Changes nothing, and asks no device."""
     found = list(resolve_steps(state.plan, from_index, steps))
     seen = PlanCheck(
         texts=tuple("" if isinstance(step, ConfigError) else step.words for step, _ in found),
@@ -180,7 +180,7 @@ class RunControl:
         return tuple(self._make_plan_step(state, planned, ends_ns) for planned in state.plan)
 
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
-        """What an edit would say."""
+        """Return what an edit would say."""
         return check_edit(self.log.state, from_index, steps, self.assembly.config)
 
     async def edit(self, from_index: int, steps: Sequence[WrittenStep]) -> int:

@@ -15,14 +15,15 @@ _ANSWERS_S = 5.0  # round number; nothing was measured
 
 
 async def list_simulated_faults(assembly: Assembly) -> SimulatedFaults:
-    """What can be broken, and what is. Conflict when this is a real stand, Unreachable when nobody simulates it."""
+    """Return what can be broken, and what is. Conflict when this is a real stand, Unreachable when nobody simulates
+    it."""
     async with _simulator(assembly) as simulator:
         return SimulatedFaults.model_validate(await simulator.request({"do": "faults"}))
 
 
 async def break_or_mend(assembly: Assembly, request: FaultRequest) -> str:
-    """What came of it, as a sentence. Missing when there is no such fault, ConfigError when the laboratory cannot have
-    it; else as `list_simulated_faults`."""
+    """Return what came of it, as a sentence. Missing when there is no such fault, ConfigError when the laboratory
+    cannot have it; else as `list_simulated_faults`."""
     name, value = request.name, request.value
     async with _simulator(assembly) as simulator:
         try:

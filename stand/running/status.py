@@ -155,7 +155,7 @@ class StatusBoard:
         return describe_doing(self._doing, self._soaked_again_s(), goes_on=self.eta.goes_on)
 
     def left_s(self, now_ns: int) -> float:
-        """How long the run still takes, from now on."""
+        """Return how long the run still takes, from now on."""
         return self.eta.left_s(now_ns)
 
     def _follow_state(self) -> None:

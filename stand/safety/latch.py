@@ -73,12 +73,12 @@ class Latch:
             self._hub.publish(LATCH_NOT_KEPT.at(now_ns, failure))
 
     def hold_gate(self) -> None:
-        """What has tripped holds the gate, unless nothing has."""
+        """Hold the gate by what has tripped, if anything has."""
         if self.fault is not None:
             self._gate.hold(INTERLOCK)
 
     async def restore(self) -> None:
-        """What a program before this one has left, and nobody has reset, holds the gate. May wait for a disk."""
+        """Hold the gate by what a program before this one has left, and nobody has reset. May wait for a disk."""
         found = None if self.file is None else await asyncio.to_thread(self.file.read)
         if found is not None:
             self.fault, self.since_ns = Fault(found.rule, found.text, "hold"), found.since_ns

@@ -47,13 +47,13 @@ class BenchResult:
 
 
 def list_devices(config: StandConfig) -> tuple[DeviceState, ...]:
-    """What there is, and what it takes; nothing is opened."""
+    """Return what there is, and what it takes; nothing is opened."""
     devices = ManualControl(assemble(config, Hub(RepeatLimit()), WallClock()), _refuse_heat).devices("")
     return tuple(each.model_copy(update={"verbs": (*_list_read_verbs(config, each), *each.verbs)}) for each in devices)
 
 
 def _list_read_verbs(config: StandConfig, device: DeviceState) -> Iterator[DeviceVerb]:
-    """What a device takes by hand besides what it takes of a daemon."""
+    """Return what a device takes by hand besides what it takes of a daemon."""
     yield DeviceVerb(verb=READ, text="what it reads")
     if any(each.name == device.name and isinstance(each.settings, OnBus) for each in config.equipment):
         yield DeviceVerb(verb=REGISTERS, text="every point of its register map")

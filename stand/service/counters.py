@@ -104,8 +104,8 @@ class StoredCounters(BaseModel):
 
 
 def load_counters(directory: Path) -> tuple[StoredCounters, str]:
-    """What a daemon before has left, and what is wrong with it, as a sentence: a damaged file is kept next to it, and
-    the counters begin again. Blocking."""
+    """Return what a daemon before has left, and what is wrong with it, as a sentence: a damaged file is kept next to
+    it, and the counters begin again. Blocking."""
     path = directory / NAME
     try:
         return StoredCounters.model_validate_json(unseal(_KIND, path.read_bytes())), ""

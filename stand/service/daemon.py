@@ -180,7 +180,7 @@ class Daemon(Host):
         self._keep.note(StoredCounters(counters=dict(self.counters.values)))
 
     def reset_queue(self) -> None:
-        """What halted it has been looked into."""
+        """Let the queue go on: what halted it has been looked into."""
         self._start_task(self._reset_queue())
 
     async def serve(self, front: Front) -> None:
@@ -260,7 +260,7 @@ class Daemon(Host):
                 await self._orders.read()
 
     async def _restart_recording(self) -> None:
-        """What an operator would do after the process that writes a run's session was killed: reset, and resume."""
+        """Do what an operator would do after the process that writes a run's session was killed: reset, and resume."""
         if self._orders.leaving or self._assembly.stand.safety.unconfirmed:
             return
         if not self._restarts.may_follow(self.open_stand.latch.fault, self._clock.now_ns()):
@@ -365,8 +365,8 @@ class Daemon(Host):
         return done
 
     async def _interruption(self, session: Path, config: StandConfig) -> Interruption:
-        """What is left of its run; Halt when it cannot be resumed. What has to be written for that is written by the
-        disk's process."""
+        """Return what is left of its run; Halt when it cannot be resumed. What has to be written for that is written by
+        the disk's process."""
         try:
             salvaged = await self._orders.repair.call(repair_session, session)
         except SessionError as error:

@@ -61,7 +61,7 @@ class Host:
         return {"queue": self.queue(), "busy": self.busy, "by_hand": by_hand}
 
     def queue(self) -> tuple[QueuedRun, ...]:
-        """What has been run, is and will be."""
+        """Return what has been run, is and will be."""
         if (guest := self.guest) is None:
             return ()
         order, began_ns = guest.job.order, self._began_ns
@@ -77,11 +77,11 @@ class Host:
         )
 
     def devices(self) -> tuple[DeviceState, ...]:
-        """What is there, and what it takes by hand now."""
+        """Return what is there, and what it takes by hand now."""
         return self.manual_control.devices(self.explain_manual_refusal())
 
     def explain_manual_refusal(self) -> str:
-        """Why no device takes an order now, "" when they do."""
+        """Return why no device takes an order now, "" when they do."""
         if self.has_run:
             return "a run has the stand; pause does not change that, STOP ends the run"
         if (fault := self.open_stand.latch.fault) is not None:
@@ -90,7 +90,8 @@ class Host:
         return f"the stand is held: {', '.join(sorted(reasons))}" if reasons else ""
 
     async def run_manual_order(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> str:
-        """What came of it within a moment, as a sentence; Conflict when that is nothing good, or it is refused."""
+        """Return what came of it within a moment, as a sentence; Conflict when that is nothing good, or it is
+        refused."""
         if refused := self.explain_manual_refusal():
             raise Conflict(refused)
         what = f"{name} {verb}"

@@ -36,7 +36,7 @@ class ManualControl:
         return "idle" if ordered is None else f"heat by hand, set-point {ordered.setpoint_degC:g} degC"
 
     def devices(self, refused: str) -> tuple[DeviceState, ...]:
-        """What there is; refused: why nothing is taken now."""
+        """Return what there is; refused: why nothing is taken now."""
         readings = self._assembly.hub.readings
         return tuple(
             DeviceState(
@@ -50,8 +50,8 @@ class ManualControl:
         )
 
     def work(self, name: str, verb: str, arguments: Mapping[str, JsonValue]) -> Work:
-        """What is to be done; Missing when there is no such device or verb, ConfigError for what it is given, Conflict
-        when the stand cannot do it now."""
+        """Return what is to be done; Missing when there is no such device or verb, ConfigError for what it is given,
+        Conflict when the stand cannot do it now."""
         if name not in self._equipment:
             raise Missing(f"this stand has no device of that name; there are {', '.join(self._equipment)}")
         verbs = {each.name: each for each in self._equipment[name].kind.verbs}

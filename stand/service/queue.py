@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def make_order(entry: QueueEntry) -> Order:
-    """What an entry asks for; ConfigError when this version of the program refuses it."""
+    """Return what an entry asks for; ConfigError when this version of the program refuses it."""
     # The process that touches the disk for a daemon loads this module, and needs none of that.
     from thermostand.stand.estimating.estimate import price_plan
     from thermostand.stand.running.order import load_register_maps, parse_order
@@ -48,7 +48,8 @@ class RunOrigin:
 
 
 def make_entry(order: Order, config: str, now_ns: int, asked: RunOrigin = RunOrigin()) -> QueueEntry:
-    """What is to be queued; `config` is the name of its configuration, for messages. Its number is given later."""
+    """Return what is to be queued; `config` is the name of its configuration, for messages. Its number is given
+    later."""
     return QueueEntry(
         id=1,
         recipe=order.recipe.name,

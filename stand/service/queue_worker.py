@@ -202,7 +202,7 @@ class StepWatch:
 
 
 def load_queued_interruption(session: Path, own: StandConfig, *, reset: bool = False) -> Interruption:
-    """What is left of the run of a session, for this stand; Halt when it cannot be resumed."""
+    """Return what is left of the run of a session, for this stand; Halt when it cannot be resumed."""
     try:
         return load_interruption(session, own, reset=reset)
     except (SessionError, ConfigError) as error:

@@ -400,8 +400,8 @@ def _choose_directory(job: Job, clock: Clock) -> Path:
 
 
 async def _announce(job: Job, assembly: Assembly, disk: DiskProcess | None = None, *, has_own: bool = False) -> None:
-    """What the session has to say before anything moves; what earlier runs that were killed have left is completed.
-    has_own: what is being recorded now is the stand's own record, which need not be announced."""
+    """Publish what the session has to say before anything moves; what earlier runs that were killed have left is
+    completed. has_own: what is being recorded now is the stand's own record, which need not be announced."""
     hub, clock = assembly.hub, assembly.clock
     for segment in await _salvage(job, assembly.clock, disk):
         if has_own and segment.reason == BEING_RECORDED:
@@ -416,8 +416,8 @@ async def _announce(job: Job, assembly: Assembly, disk: DiskProcess | None = Non
 
 
 async def _salvage(job: Job, clock: Clock, disk: DiskProcess | None) -> tuple[Salvaged, ...]:
-    """What earlier runs that were killed have left unfinished, finished before anything moves; where a stand is open,
-    by the process that touches its disk."""
+    """Return what earlier runs that were killed have left unfinished, finished before anything moves; where a stand is
+    open, by the process that touches its disk."""
     if job.before is not None:
         return job.before.salvaged
     if disk is not None:
@@ -514,8 +514,8 @@ def _make_info(job: Job, directory: Path, assembly: Assembly) -> SessionInfo:
 
 
 def _check_outcome(directory: Path, recorder: Recorder, assembly: Assembly) -> None:
-    """What is wrong with a run that has done its whole plan: nobody may take such a stand for safe, or such a session
-    for whole."""
+    """Report what is wrong with a run that has done its whole plan: nobody may take such a stand for safe, or such a
+    session for whole."""
     if unsafe := assembly.stand.safety.unconfirmed:
         raise StandTripped(f"{directory}: complete, but NOT SAFE: {'; '.join(unsafe)}")
     if recorder.frames_lost:
@@ -533,7 +533,7 @@ class _EarlyEvents:
             self._events.append(item)
 
     def take(self) -> tuple[Event, ...]:
-        """What there was; nothing is kept from now on."""
+        """Return what there was; nothing is kept from now on."""
         events, self._events = self._events or (), None
         return tuple(events)
 

@@ -185,7 +185,7 @@ class StandService(Served):
         return () if self._run is None else self._run.steps()
 
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
-        """What an edit would say; nothing is ordered, so nothing is recorded."""
+        """Return what an edit would say; nothing is ordered, so nothing is recorded."""
         return self._require_run().check_edit(from_index, steps)
 
     async def preview(self, request: RunRequest) -> RunPreview:
@@ -431,7 +431,7 @@ def describe_hold(reasons: Collection[str]) -> str:
 
 
 async def _change_plan(change: Coroutine[None, None, None]) -> None:
-    """What cannot be done with a plan as it is: Conflict."""
+    """Raise Conflict for what cannot be done with a plan as it is."""
     try:
         await change
     except (ConfigError, SessionError) as error:

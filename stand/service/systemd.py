@@ -34,7 +34,7 @@ class StatusNotice:
 
 
 def watchdog_s() -> float | None:
-    """How often it wants to be fed at the least, None when it does not."""
+    """Return how often it wants to be fed at the least, None when it does not."""
     with suppress(ValueError):
         if int(os.environ.get("WATCHDOG_PID", os.getpid())) == os.getpid():
             return int(os.environ["WATCHDOG_USEC"]) / 1e6 if "WATCHDOG_USEC" in os.environ else None

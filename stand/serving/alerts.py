@@ -68,7 +68,7 @@ class AlertTracker:
         return not any(cause in _BAD and key != "nearly full" for cause, key in tuple(self._open))
 
     def receive(self, event: Event, now_ns: int) -> list[AlertMessage]:
-        """What is to be sent at once."""
+        """Return what is to be sent at once."""
         alert = make_alert(event)
         if alert is None:
             return []
@@ -91,7 +91,7 @@ class AlertTracker:
         return self._limit([(alert.cause, TITLES[alert.cause], event.text)] if is_due else [], now_ns)
 
     def due(self, now_ns: int) -> list[AlertMessage]:
-        """What has lasted for the grace time by now."""
+        """Return what has lasted for the grace time by now."""
         found: list[tuple[AlertCause, str, str]] = []
         for (cause, key), (event, was_sent) in self._open.items():
             if not was_sent and now_ns - event.time_ns >= self.grace_ns:
@@ -127,7 +127,7 @@ _FAREWELL_S = 5.0  # real seconds for the last messages
 
 
 def missing_command(config: AlertsConfig) -> str:
-    """Why alerts.command cannot be run, "" when it can, or there is none."""
+    """Return why alerts.command cannot be run, "" when it can, or there is none."""
     if not config.command or shutil.which(config.command[0]) is not None:
         return ""
     return (

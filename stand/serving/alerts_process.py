@@ -133,7 +133,7 @@ class _Work:
         self._thread.start()
 
     def result(self, limit_s: float) -> str:
-        """What it returned, within so long."""
+        """Return what it returned, within so long."""
         self._thread.join(limit_s)
         return self._found
 

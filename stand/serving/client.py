@@ -91,8 +91,8 @@ class Server:
             connection.close()
 
     def order(self, verb: str, body: Mapping[str, object] | None = None, timeout_s: float = LIMIT_S) -> Answer:
-        """What a command to the run is answered (desk.Done). STOP goes to the socket for it, for half of the time, and
-        then as everything does."""
+        """Return what a command to the run is answered (desk.Done). STOP goes to the socket for it, for half of the
+        time, and then as everything does."""
         spent_s = 0.0
         if verb == "stop" and self.socket is not None and self.socket.suffix != STOP_SUFFIX:
             begun_s = time.monotonic()

@@ -176,7 +176,8 @@ class Served(ABC):
 
     @abstractmethod
     def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
-        """What the command `edit` would say; changes nothing. Any thread may call it. Conflict when nothing is run."""
+        """Return what the command `edit` would say; changes nothing. Any thread may call it. Conflict when nothing is
+        run."""
 
     @abstractmethod
     async def preview(self, request: RunRequest) -> RunPreview:
@@ -188,7 +189,7 @@ class Served(ABC):
 
     @abstractmethod
     async def list_simulated_faults(self) -> SimulatedFaults:
-        """What can be broken on purpose; Conflict when the stand is no simulated one."""
+        """Return what can be broken on purpose; Conflict when the stand is no simulated one."""
 
     @abstractmethod
     def make_answer(self, verb: str, text: str) -> Done:
@@ -227,8 +228,8 @@ class Served(ABC):
 
 
 def summarize_argument(given: Document | None) -> dict[str, JsonValue]:
-    """What an event has of an argument: no long text, of steps how many there are, nothing that is empty, and no flag
-    that was not set."""
+    """Return what an event has of an argument: no long text, of steps how many there are, nothing that is empty, and no
+    flag that was not set."""
     if given is None:
         return {}
     values = given.model_dump(mode="json")

@@ -319,7 +319,7 @@ class History:
 
 
 def _get_role(mark: StepMark) -> str:
-    """What the curves name a step by: a capture's role, a chamber's set-point."""
+    """Return what the curves name a step by: a capture's role, a chamber's set-point."""
     for name in ("role", "chamber_degC", "text"):
         value = mark.parameters.get(name)
         if isinstance(value, str | int | float) and value != "":

@@ -132,7 +132,7 @@ class PageData:
             await asyncio.sleep(_TAKE_S)
 
     async def _load_past(self) -> None:
-        """What was recorded before this daemon was started."""
+        """Load what was recorded before this daemon was started."""
         history, troubles = await self.ask(load_recorded_week, str(self.sessions), self._clock.now_ns())
         for trouble in troubles:
             self._warn(f"not in the curves: {trouble}")

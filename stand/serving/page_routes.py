@@ -143,8 +143,8 @@ class PageRoutes:
 
         @router.get("/api/v1/sessions/{name}/drift", response_model=DriftOfSession)
         async def drift(name: SessionName) -> Response:
-            """How the markers of a recorded session moved, from at most 120 of its frames; the first time this takes
-            up to minutes."""
+            """Return how the markers of a recorded session moved, from at most 120 of its frames; the first time this
+            takes up to minutes."""
             viewing = self._viewing
             found = await self._read_cached(
                 name, _DRIFT_LIMIT_S, viewing.search, load_session_drift, viewing.target_text
@@ -159,7 +159,7 @@ class PageRoutes:
         function: Callable[..., Any],
         argument: object,
     ) -> Any:
-        """What `function` finds in a session; kept until the session has changed."""
+        """Return what `function` finds in a session; kept until the session has changed."""
         path, changed_ns = await self._disk.ask(lambda: _get_change_key(find_session(self._viewing.sessions, name)))
         key = (function.__name__, path.name, changed_ns, argument)
         if key not in self._read_already:
@@ -180,7 +180,7 @@ class PageRoutes:
 
         @router.get("/api/v1/frame", response_model=FrameFacts, responses={204: {"description": "No frame yet"}})
         async def frame(camera: Camera = "") -> Response:
-            """What is to be seen in the last frame of a camera; without a name, of the first that has one."""
+            """Return what the last frame of a camera shows; without a name, of the first that has one."""
             preview = _get_preview(viewing, camera)
             if preview is None:
                 return Response(status_code=204)

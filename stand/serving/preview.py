@@ -82,7 +82,7 @@ class Previewer:
         self._reference: dict[str, tuple[int, Float]] = {}
 
     def look(self, shot: FrameShot) -> Preview:
-        """What there is to see in a frame; one without the target has no markers and says why."""
+        """Return what there is to see in a frame; one without the target has no markers and says why."""
         grey = convert_to_grey(shot.image)
         height, width = grey.shape
         found, trouble = None, ""
@@ -139,7 +139,7 @@ def encode_half_jpeg(image: Image) -> bytes:
 
 
 def measure_setup(grey: Image, found: Detection | None, target: Target) -> Setup:
-    """What helps to set a camera up."""
+    """Return what helps to set a camera up."""
     top = int(np.iinfo(grey.dtype).max)
     counts = np.bincount(grey.ravel() >> (2 if top == 255 else 10), minlength=_BINS)
     shares = tuple(round(float(count) / grey.size, 6) for count in counts)
@@ -173,8 +173,8 @@ def compute_tilt_deg(homography: Float, target: Target) -> float | None:
 
 
 def compute_keystone_percent(homography: Float, target: Target) -> tuple[float, float]:
-    """How much larger the end of the target that is right in the image appears than the left one, and the lower one
-    than the upper one, %."""
+    """Return how much larger the end of the target that is right in the image appears than the left one, and the lower
+    one than the upper one, %."""
     nominal = target.coordinates_mm()
     low, high = nominal.min(axis=0), nominal.max(axis=0)
     middle = (low + high) / 2

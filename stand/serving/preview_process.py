@@ -36,7 +36,7 @@ def load_session_columns(path: str, points: int) -> Columns:
 
 
 def load_session_drift(path: str, target_text: str) -> SessionDrift:
-    """How a recorded session's markers moved; SessionError when it cannot be read."""
+    """Return how a recorded session's markers moved; SessionError when it cannot be read."""
     import cv2
 
     from thermostand.stand.serving.recorded_drift import compute_session_drift
@@ -46,14 +46,14 @@ def load_session_drift(path: str, target_text: str) -> SessionDrift:
 
 
 def load_run_references(path: str) -> tuple[RecalledReference, ...]:
-    """What the drift of an interrupted run counts from; SessionError when its session cannot be read."""
+    """Return what the drift of an interrupted run counts from; SessionError when its session cannot be read."""
     from thermostand.stand.serving.recorded_drift import find_run_references
 
     return find_run_references(path)
 
 
 def load_recorded_week(directory: str, now_ns: int) -> tuple[History, list[str]]:
-    """What a daemon before this one has recorded."""
+    """Return what a daemon before this one has recorded."""
     from thermostand.stand.serving.recorded_history import read_recorded_week
 
     return read_recorded_week(Path(directory), now_ns)

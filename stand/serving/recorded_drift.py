@@ -47,8 +47,8 @@ class RecalledReference:
 
 
 def find_run_references(path: Path | str) -> tuple[RecalledReference, ...]:
-    """What drift was measured against when the run of this session was interrupted, for each camera whose frames are
-    recorded; found by the rule that held when they came. SessionError when the session cannot be read."""
+    """Return what drift was measured against when the run of this session was interrupted, for each camera whose frames
+    are recorded; found by the rule that held when they came. SessionError when the session cannot be read."""
     session = Session.open(path)
     table = session.frames_table()
     found: list[RecalledReference] = []

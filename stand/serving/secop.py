@@ -126,7 +126,7 @@ class Report(NamedTuple):
 
 
 def _make_report(parameter: Parameter, state: StandState) -> Report:
-    """What is read now; a BAD reading is an error, never an old value."""
+    """Return what is read now; a BAD reading is an error, never an old value."""
     found = parameter.read(state)
     if found is None:
         return Report("ReadFailed", "it has not been read")

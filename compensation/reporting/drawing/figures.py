@@ -186,7 +186,7 @@ def make_band(x: Float, reach: Float, label: str) -> Mark:
 
 
 def make_histogram(values: Float, bins: Any, colour: str, label: str, **look: Any) -> Mark:
-    """How often values (M,) occur."""
+    """Draw how often values (M,) occur."""
     return lambda axes: axes.hist(values, bins, color=colour, label=label, **look)
 
 

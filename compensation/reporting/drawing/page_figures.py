@@ -101,7 +101,8 @@ def draw_rays_against_pinhole(calibration: CameraCalibration) -> Figure:
 
 
 def draw_corrections(calibration: CameraCalibration) -> Figure:
-    """What the adjustment changed: the board in its plane, and the recorded table positions, with uncertainties."""
+    """Draw what the adjustment changed: the board in its plane, and the recorded table positions, with
+    uncertainties."""
     adjustment = calibration.adjustment
     moved_um = 1e3 * (adjustment.scene.points_mm - adjustment.board.points_mm)
     sigma_um, number = 1e3 * adjustment.points_sigma_mm, np.arange(1, len(moved_um) + 1)

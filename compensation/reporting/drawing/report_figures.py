@@ -113,7 +113,7 @@ def draw_against_time(observations: Observations) -> Figure:
 
 
 def _mark_spots(observations: Observations, starts: Sequence[float]) -> Iterator[Mark]:
-    """What the thermal imager saw, from the first to the last frame of each session."""
+    """Return what the thermal imager saw, from the first to the last frame of each session."""
     names = list(dict.fromkeys(name for session in observations.sessions for name in session.spots))
     for index, (session, start) in enumerate(zip(observations.sessions, starts, strict=True)):
         own = observations.time_ns[observations.session == index]
@@ -249,7 +249,7 @@ def draw_measured_against_model(evaluation: Evaluation) -> Figure:
 
 
 def draw_residual_map(observations: Observations, evaluation: Evaluation) -> Figure:
-    """What is left at each marker of each scored set-point, as arrows over the image."""
+    """Draw what is left at each marker of each scored set-point, as arrows over the image."""
     rows = evaluation.rows
     keys = np.stack([rows.chamber_degC, rows.marker], axis=1)
     groups, index, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
@@ -260,7 +260,8 @@ def draw_residual_map(observations: Observations, evaluation: Evaluation) -> Fig
 
 
 def draw_residuals(evaluation: Evaluation) -> Figure:
-    """What is left of each scored centre's deviation, against the camera's temperature, and the claimed interval."""
+    """Draw what is left of each scored centre's deviation, against the camera's temperature, and the claimed
+    interval."""
     camera_degC = evaluation.rows.camera_degC
     left_mpx = -1e3 * evaluation.after_px
     drawn = thin(len(left_mpx), _MOST_DOTS)

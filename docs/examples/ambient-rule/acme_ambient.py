@@ -17,7 +17,7 @@ class Settings(Document):
 
 
 def watches(settings: Settings, config: Any) -> list[Watch]:
-    """What is judged every `guard.period_s`, how long it must object, and what is then done."""
+    """Return what is judged every `guard.period_s`, how long it must object, and what is then done."""
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         value_degC = get_value(readings, "thermometers.laboratory")

@@ -26,7 +26,7 @@ class LampOn(Step):
         return "the lamp stands too near the camera" if self.percent > 90 else ""
 
     def price(self, found: Situation, stand: KnownStand) -> Price:
-        """How long it takes, s."""
+        """Return how long it takes, s."""
         return Price(self.kind, 4.0)
 
     async def perform(self, stand: PerformingStand) -> None:

@@ -13,7 +13,7 @@ class FakeLamp:
         bench.listen(name, settings["address"], lambda: LineEngine(self.answer))
 
     def answer(self, line: bytes) -> bytes:
-        """What it sends for a line."""
+        """Return what it sends for a line."""
         if line.strip() != b"?":
             self.percent = float(line)
         return b"I=%.2f" % (self.percent / 100)

@@ -118,7 +118,8 @@ async def _check(look: DeviceCheck) -> None:
 
 
 def check_line(cameras: Mapping[str, CameraSettings], name: str) -> Iterator[Finding]:
-    """What the camera of that name needs of its line, by the stand's file; none for one that has a line of its own."""
+    """Return what the camera of that name needs of its line, by the stand's file; none for one that has a line of its
+    own."""
     for line in compute_line_shares(cameras):
         if line.name == name and line.shared_by > 1:
             fits = line.frame_s <= 1 / cameras[name].frame_rate_hz
@@ -144,7 +145,7 @@ def _mend_relays(_: DeviceError) -> str:
 
 
 async def check_settings(camera: Camera, add: Add) -> None:
-    """What the camera made of its settings, and where it shows its temperature."""
+    """Check what the camera made of its settings, and where it shows its temperature."""
     effective = cast("Any", getattr(camera, "effective", None))
     data: dict[str, object] = asdict(cast("Any", effective)) if is_dataclass(effective) else {}
     size = f"{data['width_px']} x {data['height_px']} {data['pixel_format']}, " if "width_px" in data else ""

@@ -67,7 +67,7 @@ def compute_line_shares(cameras: Mapping[str, CameraSettings]) -> tuple[CameraLi
 
 
 def explain_overload(cameras: Mapping[str, CameraSettings], interval_s: float) -> str:
-    """Why the line does not carry a frame of each camera every `interval_s`, "" when it does."""
+    """Return why the line does not carry a frame of each camera every `interval_s`, "" when it does."""
     for line in compute_line_shares(cameras):
         if line.frame_s > interval_s:
             return (

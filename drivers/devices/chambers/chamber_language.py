@@ -64,7 +64,7 @@ class ChamberLanguage(ABC):
         self.client = LineClient.at(name, settings.address, line, times_s, is_text=is_text)
 
     def identity(self) -> str:
-        """What it says of itself; "" when it says nothing."""
+        """Return what it says of itself; "" when it says nothing."""
         return ""
 
     def limits_degC(self) -> tuple[float, float] | None:
@@ -73,7 +73,7 @@ class ChamberLanguage(ABC):
 
     @abstractmethod
     def state(self) -> ChamberState:
-        """How it is now."""
+        """Return how it is now."""
 
     @abstractmethod
     def set_temperature(self, degC: float) -> None:
@@ -89,7 +89,7 @@ class ChamberLanguage(ABC):
         """Start or stop, once."""
 
     def renew(self) -> None:  # noqa: B027 - most have no dead-man
-        """What keeps its own dead-man, if it has one, from stopping it."""
+        """Keep the chamber's own dead-man, if it has one, from stopping it."""
 
 
 def parse_line(heard: bytes) -> str | None:

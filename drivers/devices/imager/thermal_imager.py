@@ -156,8 +156,8 @@ class ThermalImager:
             lane.close()
 
     async def read(self) -> tuple[Reading, ...]:
-        """What the last picture says, once; STALE when it is older than stale_after_s, BAD before the first, and while
-        the folder is gone (a card pulled out, a share not mounted)."""
+        """Return what the last picture says, once; STALE when it is older than stale_after_s, BAD before the first, and
+        while the folder is gone (a card pulled out, a share not mounted)."""
         if self._worker is None:
             raise Unreachable(self.name, "not open")
         listed = await self._worker.call(self._list_pictures)
@@ -246,7 +246,8 @@ class ThermalImager:
         return listed
 
     def _take_picture(self, name: str, now_ns: int) -> list[Item]:
-        """What a settled file gives: a picture and what was found, or why not; nothing while it may still grow."""
+        """Return what a settled file gives: a picture and what was found, or why not; nothing while it may still
+        grow."""
         seen = (self._files or {})[name]
         try:
             data = self._content(name)

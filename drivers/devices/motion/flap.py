@@ -125,8 +125,8 @@ class Travel:
         return self._confirmed >= CONFIRMATIONS
 
     def look(self, position: int, saturated: bool, time_ns: int) -> str:
-        """What is wrong, "" when nothing is; `time_ns` is when the position was read, `saturated` whether the motor
-        gave (nearly) all it may."""
+        """Return what is wrong, "" when nothing is; `time_ns` is when the position was read, `saturated` whether the
+        motor gave (nearly) all it may."""
         step_ns = min(max(0, time_ns - self._seen_ns), to_ns(_LONGEST_LOOK_S))
         self._seen_ns = time_ns
         self._watched_ns += step_ns

@@ -413,7 +413,7 @@ def read_speed_steps_s(client: XimcClient) -> float:
 
 
 def describe_changed_settings(profile: StageProfile, speed: float, power_off: float | None) -> str:
-    """What somebody else has changed, in words; "" when all is as the profile says."""
+    """Return what somebody else has changed, in words; "" when all is as the profile says."""
     pairs = (("speed", speed, profile.speed, "steps/s"), ("power-off delay", power_off, profile.power_off_s, "s"))
     return "; ".join(
         f"{what} {_format_value(is_, unit)}, not {_format_value(wanted, unit)} as in its profile"
@@ -427,7 +427,7 @@ def _format_value(value: float | None, unit: str) -> str:
 
 
 def _decode_text(field: bytes) -> str:
-    """What is printable of a text field that is filled up with zeros."""
+    """Return what is printable of a text field that is filled up with zeros."""
     return "".join(each for each in field.partition(b"\0")[0].decode("latin-1") if each.isprintable()).strip()
 
 

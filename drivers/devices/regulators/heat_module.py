@@ -230,7 +230,7 @@ class HeatModule:
             raise DeviceFault(self.name, f"{text}; set it at the module: it is not heated with")
 
     async def _compare(self) -> None:
-        """What it gives with what it was left at; the trip lasts."""
+        """Compare what it gives with what it was left at; the trip lasts."""
         age_s = (self._clock.now_ns() - (self._armed_ns or 0)) / NS_PER_S
         given_mA = await self._read_output_mA()
         if self._last[-1].value == 1:
@@ -299,7 +299,7 @@ class HeatModule:
         raise DeviceFault(self.name, f"is not confirmed at {zero_mA:g} mA, it gives {given_mA:.2f} mA{error}")
 
     async def _read_output_mA(self) -> float:
-        """What flows, mA, and whether it has tripped, which become the readings."""
+        """Return what flows, mA, and whether it has tripped, which become the readings."""
         try:
             snapshot = await self._unit.snapshot([self._present, _TRIPPED])
             sample, now_ns = snapshot.samples[self._present], self._clock.now_ns()

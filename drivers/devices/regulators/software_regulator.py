@@ -225,7 +225,7 @@ class SoftwareRegulator:
         return self._heat.uncontrolled
 
     async def open(self) -> None:
-        """What it heats by; thermometer and relays are devices of their own."""
+        """Open what it heats by; thermometer and relays are devices of their own."""
         await self._heat.open()
 
     async def close(self) -> None:
@@ -320,7 +320,7 @@ class SoftwareRegulator:
             await self._pause()
 
     async def _run_limit_cycle(self, tuning: Tuning) -> UltimatePoint:
-        """What the limit cycle shows, once it is even."""
+        """Return what the limit cycle shows, once it is even."""
         while (point := relay_tuning.find_ultimate_point(tuning, self._settings.autotune)) is None:
             self._check_controls()
             if tuning.failure:

@@ -240,7 +240,7 @@ class FakeCamera:
         self._effects = self._effects_by_feature()
 
     def _effects_by_feature(self) -> dict[str, Callable[[int], None]]:
-        """What writing a feature does at an instant, ns."""
+        """Return what writing a feature does at an instant, ns."""
         return {
             "AcquisitionStart": self._schedule.start,
             "AcquisitionStop": lambda now_ns: self._schedule.stop(),

@@ -222,7 +222,7 @@ class SparseMemory:
             written += len(piece)
 
     def copy(self) -> dict[int, bytearray]:
-        """What it holds now, for `restore`."""
+        """Return what it holds now, for `restore`."""
         return {page: bytearray(held) for page, held in self._pages.items()}
 
     def restore(self, copy: dict[int, bytearray]) -> None:
@@ -334,7 +334,7 @@ class EvaluatedFile:
         self._library["arv_gc_enumeration_set_string_value"](self._node(name), entry.encode())
 
     def command_value(self, name: str) -> int:
-        """What a Command writes; ConfigError when that is no number."""
+        """Return what a Command writes; ConfigError when that is no number."""
         named = self.file.find_named(name, "pCommandValue")
         if named in self.file:
             return round(self.get(named))

@@ -179,7 +179,7 @@ class Resend:
 
 
 def unpack_resend(request: GvcpRequest) -> Resend:
-    """What a PACKETRESEND asks for; Nack when it is too short."""
+    """Return what a PACKETRESEND asks for; Nack when it is too short."""
     extended = bool(request.flags & EXTENDED_IDS)
     layout = _RESEND_EXTENDED if extended else _RESEND
     if len(request.payload) < layout.size:

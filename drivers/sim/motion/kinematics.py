@@ -61,7 +61,7 @@ class Path:
         return self.end, 0.0
 
     def after(self, elapsed_s: float) -> Path:
-        """What remains of it at `elapsed_s`."""
+        """Return what remains of it at `elapsed_s`."""
         for index, phase in enumerate(self.phases):
             if elapsed_s < phase.duration_s:
                 position, speed = phase.at(elapsed_s)

@@ -223,7 +223,7 @@ class Stepper:
         return Journey(time_ns, path, self._slip(travel, time_ns), energised=travel.energised, rest_ns=rest_ns)
 
     def _find_end(self, travel: Journey) -> LegEnd | None:
-        """How the leg under way will end, None when there is none or it never does."""
+        """Return how the leg under way will end, None when there is none or it never does."""
         if travel.leg is None:
             return None
         endings = [(travel.path.duration_s, travel.path.end, 0)]

@@ -115,7 +115,7 @@ def compute_strain(temperature_degC: float, expansion_per_K: float, einstein_K: 
 
 
 def compute_pad_sag_mm(temperature_degC: float) -> float:
-    """How far the elastic lens mounting gives under its load: it softens by a third around 45 degC."""
+    """Return how far the elastic lens mounting gives under its load: it softens by a third around 45 degC."""
     softening = 0.33 / (1.0 + math.exp((45.0 - temperature_degC) / 12.0))
     return 1.2e-3 / (1.0 - softening)
 

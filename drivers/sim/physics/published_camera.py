@@ -155,7 +155,7 @@ class PublishedCamera:
         )
 
     def _compute_shifts(self, camera_roll_rad: float, away_K: list[float]) -> Iterator[tuple[float, ...]]:
-        """What the effects move the principal point by, px."""
+        """Return what the effects move the principal point by, px."""
         if "sag" in self._effects:
             down = (math.sin(camera_roll_rad), math.cos(camera_roll_rad))
             yield _scale(down, self._give_px * math.expm1(away_K[CELL] / self._softening_K))

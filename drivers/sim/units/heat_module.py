@@ -111,7 +111,7 @@ class FakeHeatModule(BusUnit):
             self.values_mA[self._channel] = current_mA
 
     def output_mA(self) -> float:
-        """What flows now."""
+        """Return what flows now."""
         with self._now():
             return self._flows_mA(self._channel)
 

@@ -47,7 +47,7 @@ class RadiometricShot:
 
 
 def compute_counts(celsius: NDArray[np.float64], emissivity: float = 1.0) -> NDArray[np.uint16]:
-    """What the sensor counts."""
+    """Return what the sensor counts."""
     own, routes = (R1 / (R2 * (np.exp(B / kelvin) - F)) - O for kelvin in (celsius + KELVIN, np.float64(AMBIENT_K)))
     radiance = emissivity * own + (1 - emissivity) * routes
     return np.clip(np.rint(radiance), 0, 65535).astype(np.uint16)

@@ -80,8 +80,8 @@ class RtdModule(BusUnit):
         plant.on_step.append(self._on_step)
 
     def measured_degC(self, place: int) -> float:
-        """What the converter sees on the channel at that place of the module, 0 is the first: an open wire is far above
-        every range, a short far below."""
+        """Return what the converter sees on the channel at that place of the module, 0 is the first: an open wire is
+        far above every range, a short far below."""
         channel = self._first + place
         if channel in self.open_channels or channel not in self._sensors:
             return float("inf")

@@ -60,7 +60,7 @@ app = App(
 
 @app.command()
 def info(directory: SessionArgument) -> None:
-    """What a session holds: when, steps, frames, gaps, temperatures, events, versions.
+    """Show what a session holds: when, steps, frames, gaps, temperatures, events, versions.
 
     Example: stand session info sessions/20260101T180000Z-thermal-cycle
     """

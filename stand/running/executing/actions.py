@@ -205,7 +205,7 @@ def needs_retake(state: RunState, around: Surroundings, planned: PlannedStep) ->
 
 
 def _find_preparation(state: RunState, around: Surroundings, planned: PlannedStep) -> Action | None:
-    """What is needed before the step; None when everything is as the steps before it have left it."""
+    """Return what is needed before the step; None when everything is as the steps before it have left it."""
     set_up = state.set_up
     if state.is_setup_invalid:
         if again := find_cold_start_steps(state):

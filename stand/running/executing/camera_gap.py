@@ -153,7 +153,7 @@ class CameraHistory:
 def explain_possible_power_loss(
     before: CameraHistory, boot_id: str | None, was_supplied: bool | None, reading: Reading | None
 ) -> str:
-    """Why the camera may have been off since, "" when it was not.
+    """Return why the camera may have been off since, "" when it was not.
 
     boot_id: of the host now, None in virtual time. was_supplied: whether its supply read on before it was switched on,
     None when that is not known. reading: its first temperature.

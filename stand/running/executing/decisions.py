@@ -100,8 +100,8 @@ def _parse_decision(found: Mapping[str, Any]) -> Decision:
 
 
 def make_plan_change(state: RunState, planned: PlannedStep, decided: Decision, time_ns: int) -> Edited | None:
-    """What the decision of the step `planned` makes of the plan; None when an operator has changed what it decides
-    about."""
+    """Return what the decision of the step `planned` makes of the plan; None when an operator has changed what it
+    decides about."""
     step = planned.step
     if not isinstance(step, Decide):
         raise ValueError(f"{step.kind} decides nothing")

@@ -282,7 +282,7 @@ class Executor:
         self._stand.imaging.supply.equilibrium.unsubscribe(self._on_lost_equilibrium)
 
     async def run(self) -> None:
-        """What is not done of the plan."""
+        """Perform what is not done of the plan."""
         while (action := choose_next_action(self._state, self._surroundings())) is not None:
             with self._mark_failure():
                 is_done = await self._try(action)
@@ -339,7 +339,7 @@ class Executor:
 
     @contextmanager
     def _mark_failure(self) -> Generator[None]:
-        """What ends the run inside is the failure of the step under way."""
+        """Count what ends the run inside as the failure of the step under way."""
         try:
             yield
         except (Exception, asyncio.CancelledError):
@@ -407,7 +407,7 @@ class Executor:
                 pass  # what is under way has failed
 
     async def _conclude(self, action: Action) -> None:
-        """What follows when the step under way is done, or has to wait for those before it."""
+        """Do what follows when the step under way is done, or has to wait for those before it."""
         match action:
             case Complete(planned) if needs_retake(self._state, self._surroundings(), planned):
                 pass  # by the flush: it is taken again

@@ -75,8 +75,8 @@ class SettlingWatch:
         self._due_ns = None
 
     def in_band_s(self, chamber_degC: float, band_K: float) -> float:
-        """How long the chamber has been within `band_K` of its set-point, as far as it is known without a gap, s;
-        0 when it is not, or is not known now."""
+        """Return how long the chamber has been within `band_K` of its set-point, as far as it is known without a gap,
+        s; 0 when it is not, or is not known now."""
         now_s, (time_s, pv_degC) = to_seconds(self._clock.now_ns()), np.array(self._readings[CHAMBER]).reshape(-1, 2).T
         if not time_s.size or now_s - time_s[-1] > _UNKNOWN_S:
             return 0.0

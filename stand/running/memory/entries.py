@@ -236,7 +236,7 @@ def parse_change(time_ns: int, data: Mapping[str, object]) -> Change | None:
 
 
 def encode(entry: JournalEntry) -> bytes:
-    """What its line says."""
+    """Return what its line says."""
     return json.dumps({"entry": _NAMES[type(entry)], **asdict(entry)}).encode()
 
 

@@ -52,8 +52,8 @@ def fold(plan: Iterable[PlannedStep], entries: Iterable[Entry]) -> RunState:
 
 
 def apply_entry(state: RunState, entry: Entry) -> RunState:
-    """What the state is after one more entry. What does not fit, such as a change of a step that is done, changes
-    nothing."""
+    """Return what the state is after one more entry. What does not fit, such as a change of a step that is done,
+    changes nothing."""
     match entry:
         case StepChanged():
             return _apply_begin(state, entry) if entry.state == "started" else _apply_end(state, entry)
@@ -94,7 +94,7 @@ def apply_entry(state: RunState, entry: Entry) -> RunState:
 
 
 def find_refusal(state: RunState, change: Change) -> str:
-    """Why the plan cannot be changed so, "" when it can."""
+    """Return why the plan cannot be changed so, "" when it can."""
     if state.index >= len(state.plan):
         return "the plan is done"
     if isinstance(change, Edited):
@@ -281,7 +281,7 @@ def _apply_restart(state: RunState, entry: Again) -> RunState:
 
 
 def _forget_ends(state: RunState, step_ids: Collection[str]) -> Mapping[str, str]:
-    """How soaks have ended, but for these: they go on, or are soaked again."""
+    """Return how soaks have ended, but for these: they go on, or are soaked again."""
     return MappingProxyType({each: ended for each, ended in state.soaked.items() if each not in step_ids})
 
 

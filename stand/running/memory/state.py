@@ -92,7 +92,7 @@ class SetUp:
     others: Mapping[str, PlannedStep] = field(default_factory=lambda: MappingProxyType({}))
 
     def after(self, planned: PlannedStep) -> SetUp:
-        """What it is when that step, too, is done."""
+        """Return what it is when that step, too, is done."""
         match planned.step:
             case StartChamber(chamber_degC) | SetTemperature(chamber_degC):
                 return replace(self, chamber_degC=chamber_degC, soaks=())
@@ -230,7 +230,7 @@ class RunState:
         return next((planned for planned in self.plan if planned.step_id == step_id), None)
 
     def remaining_ns(self, soak: PlannedStep) -> int:
-        """How much of its longest time the soak has still to go; nothing when it has ended, or is left out."""
+        """Return how much of its longest time the soak has still to go; nothing when it has ended, or is left out."""
         if soak.step_id in self.soaked or soak.step_id in self.skipped:
             return 0
         duration_ns = get_duration_ns(soak)
@@ -238,10 +238,10 @@ class RunState:
         return max(0, duration_ns - soaked_ns)
 
     def outage_ns(self, now_ns: int) -> int:
-        """How long the run stood still since the camera was last seen."""
+        """Return how long the run stood still since the camera was last seen."""
         return self.out_ns + (0 if self.out_since_ns is None else now_ns - self.out_since_ns)
 
 
 def get_duration_ns(soak: PlannedStep) -> int:
-    """What the soak takes at the most, ns; 0 when it is no soak."""
+    """Return what the soak takes at the most, ns; 0 when it is no soak."""
     return to_ns(soak.step.longest_s) if isinstance(soak.step, AnySoak) else 0

@@ -146,8 +146,8 @@ class OpenStand:
         self._tasks.extend(map(asyncio.create_task, works))
 
     async def run_or_make_safe(self, work: Coroutine[None, None, Result], stop: Stop) -> Result:
-        """What `work` returns; when it fails or is stopped before anything was permitted, all that already answers is
-        made safe."""
+        """Return what `work` returns; when it fails or is stopped before anything was permitted, all that already
+        answers is made safe."""
         try:
             return await run_with_background(work, self.tasks)
         except BaseException:

@@ -66,7 +66,7 @@ def list_addresses(config: StandConfig) -> tuple[LockAddress, ...]:
 
 
 def find_latch_file(config: StandConfig) -> LatchFile:
-    """What is latched of the stand of a configuration; asks the name service, as `addresses`."""
+    """Return what is latched of the stand of a configuration; asks the name service, as `addresses`."""
     places = sorted({each.place for each in list_addresses(config) if each.device in _HEATING})
     return LatchFile.for_addresses(make_file_name(place.partition(" in net:")[0]) for place in places)
 
@@ -203,7 +203,7 @@ def find_daemon_pid(config: StandConfig) -> int | None:
 
 
 def _read_lock(path: Path) -> dict[str, object]:
-    """What the locked file says; LookupError when no process has it locked, else what reading raises."""
+    """Return what the locked file says; LookupError when no process has it locked, else what reading raises."""
     with path.open("rb") as file:
         if try_lock(file.fileno(), shared=True):
             raise LookupError(path)

@@ -311,8 +311,8 @@ def _parse_cookies(headers: Headers) -> Iterable[tuple[str, str]]:
 
 
 def is_exempt_from_token(path: str) -> bool:
-    """What needs no token: STOP, whether all is well, and the page's own files, which are no secret: it has the button
-    for STOP, and gets no data without a token."""
+    """Return what needs no token: STOP, whether all is well, and the page's own files, which are no secret: it has the
+    button for STOP, and gets no data without a token."""
     return path in (STOP_PATH, LOGIN_PATH, "/healthz", "/") or path.startswith("/static/")
 
 

@@ -255,7 +255,7 @@ def _handle_http_error(request: Request, error: Exception) -> Response:
 
 
 def _list_allowed_methods(request: Request) -> list[str]:
-    """What is done at this address, by any of its routes; HEAD is answered where GET is."""
+    """Return what is done at this address, by any of its routes; HEAD is answered where GET is."""
     scope = {"type": "http", "path": request.scope["path"], "root_path": "", "headers": []}
 
     def is_done(method: str) -> bool:
@@ -266,7 +266,7 @@ def _list_allowed_methods(request: Request) -> list[str]:
 
 
 def _handle_failure(_: Request, error: Exception) -> Response:
-    """What should not happen; the gatekeeper gets it as well."""
+    """Return what should not happen; the gatekeeper gets it as well."""
     return _make_error(500, FAILED.format(type(error).__name__))
 
 

@@ -131,7 +131,7 @@ class Bridge:
     # From here on: called by the thread that serves clients, in its own loop.
 
     def take(self) -> list[tuple[int, int, Item]]:
-        """What has been published since, with its number and the offset to UTC then."""
+        """Return what has been published since, with its number and the offset to UTC then."""
         taken: list[tuple[int, int, Item]] = []
         with suppress(IndexError):
             while True:
@@ -141,8 +141,8 @@ class Bridge:
     async def ask(
         self, call: Callable[[Served], Result | Awaitable[Result]], limit_s: float = COMMAND_LIMIT_S
     ) -> Result:
-        """What `call` gives on the control loop, or what it raises. NoAnswer when that takes longer than `limit_s`:
-        it may still be done."""
+        """Return what `call` gives on the control loop, or what it raises. NoAnswer when that takes longer than
+        `limit_s`: it may still be done."""
         answer: concurrent.futures.Future[Result] = concurrent.futures.Future()
         self._post(lambda: self._call(call, answer))
         return await _wait_within(limit_s, asyncio.wrap_future(answer))
@@ -201,7 +201,7 @@ class Bridge:
         return plan
 
     async def check_edit(self, from_index: int, steps: Sequence[WrittenStep]) -> PlanCheck:
-        """What an edit of the plan would say; in a thread of its own, as `plan`."""
+        """Return what an edit of the plan would say; in a thread of its own, as `plan`."""
         return await asyncio.to_thread(self._service.check_edit, from_index, steps)
 
     def _finish_refresh(self, refreshing: asyncio.Future[None]) -> None:

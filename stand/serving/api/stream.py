@@ -159,7 +159,7 @@ class Stream:
             await asyncio.sleep(_BUSY_S if self._viewers else _IDLE_S)
 
     def pump(self) -> None:
-        """What is new since the last time."""
+        """Send what is new since the last time."""
         for seq, utc_offset_ns, item in self._bridge.take():
             self.drops += seq - self._seq - 1
             self._seq = seq
@@ -192,7 +192,7 @@ class Stream:
         return list(islice((each for each in self._events if each.seq > after), limit))
 
     def missing(self, after: int) -> StreamMessage | None:
-        """What a viewer that has seen all up to `after` cannot be given any more."""
+        """Return what a viewer that has seen all up to `after` cannot be given any more."""
         first, last = after + 1, max(self._gone_events, self._gone_readings)
         if after > self._seq:  # of another stream
             first, last = self._first + 1, self._first
@@ -208,7 +208,7 @@ class Stream:
         return [kind for kind, last in gone if last > after or is_other]
 
     def after(self, after: int) -> Iterator[StreamMessage]:
-        """What is kept of both rings, in order; all of it for a number of another stream."""
+        """Return what is kept of both rings, in order; all of it for a number of another stream."""
         after = after if after <= self._seq else self._first
         kept = sorted((*self._events, *self._readings), key=lambda message: message.seq)
         return (message for message in kept if message.seq > after)
