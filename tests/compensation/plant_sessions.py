@@ -188,7 +188,7 @@ class PlantSession:
 
 
 def record_plant_session(
-    kind: CameraKind | Published, seed: int, parts: Sequence[WarmUp | Dwell], session_id: str = "night-1"
+    kind: CameraKind | Published, seed: int, parts: Sequence[WarmUp | Dwell], session_id: str = "cycle-1"
 ) -> Seen:
     """One session from a cold camera in a chamber at 24 degC."""
     session = PlantSession(kind, seed)

@@ -57,7 +57,7 @@ def cycle(held_out_degC: Sequence[float] = (20.0, 34.0, 48.0)) -> list[Part]:
 
 
 def session(
-    parts: Sequence[Part], seed: int = 0, session_id: str = "night-1", plays: bool = False
+    parts: Sequence[Part], seed: int = 0, session_id: str = "cycle-1", plays: bool = False
 ) -> tuple[Observations, Float]:
     """Observations and the noise-free centres (F, 54, 2)."""
     rng = np.random.default_rng(seed)

@@ -157,9 +157,9 @@ def test_what_cannot_be_corrected_is_refused_with_a_sentence(
 
 
 def test_an_existing_folder_is_not_written_into(recorded: Recorded, files: dict[str, Path], tmp_path: Path):
-    (tmp_path / "there").mkdir()
-    assert "a new folder" in run("apply", files["paper"], recorded.path, "-o", tmp_path / "there", status=1)
-    assert not list((tmp_path / "there").iterdir())
+    (tmp_path / "taken").mkdir()
+    assert "a new folder" in run("apply", files["paper"], recorded.path, "-o", tmp_path / "taken", status=1)
+    assert not list((tmp_path / "taken").iterdir())
 
 
 def test_a_camera_temperature_alone_is_enough_for_the_form_that_needs_no_history(

@@ -165,7 +165,7 @@ def after(first: Observations, second: Observations) -> Observations:
 def test_of_two_sessions_each_counts_and_their_difference_is_stated():
     camera = draw_camera(2003, "unrepeated")
     one, other = (
-        record_session(camera, make_full_session(), seed, session_id=f"night-{seed}").observed for seed in (1, 2)
+        record_session(camera, make_full_session(), seed, session_id=f"cycle-{seed}").observed for seed in (1, 2)
     )
     both = after(one, other)
     sheet = compute_datasheet(both, fit_paper(both))

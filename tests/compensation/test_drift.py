@@ -273,7 +273,7 @@ def test_a_warm_up_session_given_as_well_changes_nothing(noisy: Observations, mo
 
 
 def test_two_sessions_with_the_target_moved_between_them_are_one_fit(noisy: Observations):
-    other = observations(quadratic, NOISE_PX, seed=9, session=facts("night-2"))
+    other = observations(quadratic, NOISE_PX, seed=9, session=facts("cycle-2"))
     other = replace(other, centres_px=other.centres_px + 3.0)
     fitted = fit_paper(concatenate([noisy, other]))
     points = places_px()

@@ -67,7 +67,7 @@ def test_without_held_out_frames_one_temperature_is_left_out_at_a_time():
 
 
 def test_a_model_scores_a_session_it_was_not_fitted_to(model: PaperModel):
-    other = observations(quadratic, NOISE_PX, seed=6, session=facts("night-2"))
+    other = observations(quadratic, NOISE_PX, seed=6, session=facts("cycle-2"))
     np.testing.assert_allclose(evaluate(model, other).rms_after_px, NOISE_PX * np.sqrt(1 + 1 / 8), rtol=0.06)
 
 

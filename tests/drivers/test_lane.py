@@ -123,7 +123,7 @@ class Moved:
     """Of a module that another version of the program has no more."""
 
     def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
-        return importlib.import_module, ("thermostand.foundation.not_there",)
+        return importlib.import_module, ("thermostand.foundation.missing",)
 
 
 def moved(_: object) -> Moved:

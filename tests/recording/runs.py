@@ -9,7 +9,7 @@ from thermostand.recording.format.journal_lines import JOURNAL_NAME, format_line
 from .full_session import PUBLISHED, START_NS, make_half_second, record
 
 SECONDS = 20  # five segments of each series, four frames in each
-BEGUN = {"run": "night-1", "plan": "0f", "texts": {}, "seed": 7}
+BEGUN = {"run": "cycle-1", "plan": "0f", "texts": {}, "seed": 7}
 
 
 def second(time_ns, index):

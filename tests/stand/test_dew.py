@@ -134,14 +134,14 @@ def test_what_a_hygrometer_measures_counts_and_what_is_given_while_it_tells_noth
     """At 24 degC 80 % has its dew point at 20.3, 50 % at 12.9, 20 % at -0.2 degC."""
     evening = Evening(
         tmp_path,
-        dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10, "hygrometer": "room"},
-        probes={"room": {"protocol": "vaisala", "address": "tcp:127.0.0.1:1"}},
+        dew={"humidity_percent": 50, "margin_K": 1, "flap_s": 10, "hygrometer": "hall"},
+        probes={"hall": {"protocol": "vaisala", "address": "tcp:127.0.0.1:1"}},
     )
     reported = (
-        bad_reading("room.humidity", "%", 0, "no answer")
+        bad_reading("hall.humidity", "%", 0, "no answer")
         if humidity_percent is None
-        else Reading("room.humidity", humidity_percent, "%", 0)
+        else Reading("hall.humidity", humidity_percent, "%", 0)
     )
-    evening.hub.publish(Batch("room", 0, (reported, Reading("room.temperature", 24.0, "degC", 0))))
+    evening.hub.publish(Batch("hall", 0, (reported, Reading("hall.temperature", 24.0, "degC", 0))))
     evening.look(0, 1.0, target_degC)
     assert [fault.rule for fault in evening.look(11, 1.0, target_degC)] == rules

@@ -74,8 +74,8 @@ def test_nothing_is_made_inside_a_session(session: Path, command: str, option: s
 @pytest.mark.parametrize("arguments", [("export", "--out"), ("trim", "--out"), ("replay", "--record")])
 def test_what_exists_is_not_overwritten(session: Path, tmp_path: Path, arguments: tuple[str, str]):
     command, option = arguments
-    (tmp_path / "there").mkdir()
-    assert "there: exists already" in read_refusal(command, session, option, tmp_path / "there")
+    (tmp_path / "taken").mkdir()
+    assert "taken: exists already" in read_refusal(command, session, option, tmp_path / "taken")
 
 
 def test_text_in_a_recording_cannot_write_to_the_terminal(session: Path):

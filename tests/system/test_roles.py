@@ -15,7 +15,7 @@ from thermostand.stand.guarding.rules import list_vital_channels
 THERMOMETERS: dict[str, dict[str, Any]] = {
     "base_plate": {"channel": 0, "role": "granite_inside", "certificate": "T-17"},
     "pt100_7": {"channel": 3, "role": "air"},
-    "beside_the_window": {"channel": 4, "role": "laboratory"},
+    "by_the_window": {"channel": 4, "role": "laboratory"},
     "ceiling": {"channel": 1, "role": "safety"},
     "cable": {"channel": 2},
 }
@@ -104,7 +104,7 @@ def test_the_regulators_thermometer_and_the_dew_point_go_by_roles():
     data["regulator"]["thermometer"] = "pt100_7"
     with pytest.raises(ConfigError, match=r"no thermometer pt100_7, by its role granite_inside, laboratory"):
         parse_document(yaml.safe_dump(data), StandConfig, "s.yaml")
-    del data["thermometers"]["beside_the_window"]
+    del data["thermometers"]["by_the_window"]
     data["regulator"]["thermometer"] = "air"
     with pytest.raises(ConfigError, match="role: laboratory"):
         parse_document(yaml.safe_dump(data), StandConfig, "s.yaml")

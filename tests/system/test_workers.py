@@ -46,7 +46,7 @@ def pytest_in(folder: Path, *options: str) -> str:
     (folder / "test_many.py").write_text(MANY)
     command = [sys.executable, "-m", "pytest", "-c", os.devnull, "--rootdir", ".", "-p", "no:cacheprovider", *options]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
-    output = folder / "said.txt"  # a pipe would be open until the process that a test has left ends
+    output = folder / "output.txt"  # a pipe would be open until the process that a test has left ends
     with output.open("w") as file:
         done = subprocess.run(command, cwd=folder, env=environment, stdout=file, stderr=subprocess.STDOUT, timeout=100)
     assert done.returncode == 1, output.read_text()

@@ -101,7 +101,7 @@ def list_planned_faults(case: Case, now_ns: int, folder: Path, life: int) -> lis
     socket."""
     if life >= MENDED_AT_LIFE or case.is_real:
         return []
-    log = "".join((folder / f"said-{number}.txt").read_text() for number in range(1, life))
+    log = "".join((folder / f"output-{number}.txt").read_text() for number in range(1, life))
     path = folder / f"truth-{life - 1}.bin"
     before = path.read_bytes()[-ROW.size :] if path.exists() else b""
     until_ns = max(now_ns, ROW.unpack(before)[0] if before else 0)

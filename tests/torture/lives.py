@@ -76,7 +76,7 @@ def _life(folder: Path, number: int, command: list[str]) -> Life:
     program = [sys.executable, "-m", "tests.torture.product", str(folder), str(number), *command]
     process = fork_server.popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     status, out, err = _wait_for_end(process, folder / f"truth-{number}.bin")
-    (folder / f"said-{number}.txt").write_text(out + err)
+    (folder / f"output-{number}.txt").write_text(out + err)
     for _ in range(round(_LABORATORY_S / _LOOK_S)):
         if not (folder / f"begun-{number}").exists():
             break

@@ -468,7 +468,7 @@ class Bench:
         command = ["serve", str(self._folder / "stand.yaml"), "--out", str(self.disk / "out"), "--no-reports"]
         command += ["--port", str(self.port), "--secop", str(self.secop)]
         program = [sys.executable, "-X", "faulthandler", "-m", "thermostand.stand.cli", *command]
-        self._output = self._folder / f"said-{self._daemons}.txt"
+        self._output = self._folder / f"output-{self._daemons}.txt"
         self._daemons += 1
         with self._output.open("w") as file:
             self.daemon = subprocess.Popen(program, cwd=ROOT, env=self._env, stdout=file, stderr=file, text=True)
