@@ -15,7 +15,7 @@ WANTED_STATES: tuple[WantedState, ...] = ("at_rest",)
 # Ten digits of a regulator's display. A chamber that is too weak for it still gives frames, which are marked.
 SOAK_BAND_K = 1.0
 COLDEST_degC, WARMEST_degC = -10.0, 70.0  # the paper's chamber, section 2
-_SHORTEST_DWELL_s = 60.0
+_SHORTEST_DWELL_s = 60.0  # shorter is a slip of the unit; not measured
 Chamber_degC = Annotated[float, Field(ge=COLDEST_degC, le=WARMEST_degC)]
 Wait_s = Annotated[float, Field(ge=0, le=7 * 86400)]  # longer is a slip of the keyboard
 FrameCount = Annotated[int, Field(ge=1, le=1_000_000)]

@@ -591,7 +591,7 @@ def _require_set_point(degC: float | None, remedy: str) -> float:
 
 # A flap's travel with its confirmation, until recorded sessions have shown better, s.
 _FLAP_TRAVEL_S = 3.0
-_FLAP_AT_REST_S = 0.2
+_FLAP_AT_REST_S = 0.2  # as _FLAP_TRAVEL_S, with nothing to wait for
 
 
 def _price_flap(travels: bool) -> Price:
@@ -714,7 +714,7 @@ class Capture(Step):
 
 # Homing from near the switch, and the confirmation of a move, until recorded sessions have shown better, s.
 _HOMING_S = 15.0
-_MOVE_CONFIRMED_S = 0.1
+_MOVE_CONFIRMED_S = 0.1  # as _HOMING_S: until recorded sessions have shown better
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.foundation.workers import WorkerConnection, answer_all
 
 _END_WITHIN_S = 0.5  # round number; nothing was measured
-_LOOK_S = 0.01
+_LOOK_S = 0.01  # of the loop that waits for an answer; not measured
 
 
 class WorkerProcess:

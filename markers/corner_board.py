@@ -27,7 +27,7 @@ from thermostand.markers.noise import Image, find_full_scale_DN
 Positive = Annotated[float, Field(gt=0)]
 Float = NDArray[np.float64]
 
-_BORDER_BITS = 2
+_BORDER_BITS = 2  # of the AprilTags that are printed with such a board
 _LEAST_TAGS = 4  # four fit a homography
 _NEAR = 0.25
 """Of a tag's side: how far a corner may lie from where the places of the tags expect it."""

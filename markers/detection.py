@@ -67,7 +67,7 @@ _CORRELATION_LIMIT, _SUSPECT_CORRELATION_LIMIT = 0.35, 0.3
 """Growth along x and y and of the levels' variance: each scatters by itself where there is only noise, and they grow
 together where residuals hang together: 0.05 +- 0.09 by noise alone (54 markers), 0.59 +- 0.12 by JPEG of quality 90."""
 _CHANCE_SIGMAS = 3.0  # standard deviations of what chance makes of the sum
-_LEVELS_LIMIT = 1.3
+_LEVELS_LIMIT = 1.3  # the figures above are with it
 _BEYOND_CHANCE = 1.5
 """Of a mean square over a frame's markers, 54 of them: chance reaches it once in a hundred frames."""
 
@@ -330,8 +330,8 @@ __all__ = [
 _POOR_CHI = 1.25
 _POOR_MISFIT = 1.6
 """Of 36 sectors less the numbers of the ellipse, or of a plane: chance reaches it once in a million markers."""
-_LEAST_CONTRAST_SIGMA = 5.0
-_SIZE_TOLERANCE = 1.35
+_LEAST_CONTRAST_SIGMA = 5.0  # of one pixel: less is no disc but noise; round number, not measured
+_SIZE_TOLERANCE = 1.35  # neighbours on one plate differ by perspective only; not measured
 # As in the gate of identification (grid.py); half a pitch away lies the middle between two markers.
 _PLACE_TOLERANCE_PITCH = 0.2
 _FLAT_PART = 0.25

@@ -43,9 +43,9 @@ LEAST_SEEN = 6
 _OWN_PLACE = (0.2, 0.06)
 """A marker is this close to where the others put it, in distances of neighbours: while some of them may be wrong, and
 when those have gone."""
-_BEYOND_CELLS = 2
-_REACH = 0.35
-_SETTLING_SHARE = 0.7
+_BEYOND_CELLS = 2  # rows beyond the found ones in which a target may go on; not measured
+_REACH = 0.35  # of a pitch; at 0.5 a candidate belongs to two places
+_SETTLING_SHARE = 0.7  # of the best placement's markers; not measured
 # Tighter than the gate of 0.2 behind it.
 _RANSAC_PITCH = 0.12
 _QUARTER_TURN = np.array([[0, 1], [-1, 0]])
@@ -313,7 +313,7 @@ __all__ = [
 # were refused and none was wrong.
 _AMBIGUOUS_RESIDUAL = 1.5
 _AMBIGUOUS_ROLL_DEG = 30.0  # turns that differ by less are refused; round number, nothing was measured
-_TRACKED_PITCH = 0.5
+_TRACKED_PITCH = 0.5  # beyond it another marker is nearer
 _MOST_SPOTS, _MOST_SPOTS_PER_MARKER = 2000, 20
 """Among more spots that look like markers nothing is looked for: the time grows with their number."""
 _LARGEST_LATTICE = 4

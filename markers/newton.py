@@ -38,7 +38,7 @@ CORE_SIGMA = 5.0
 """The blurs from the outline within which a pixel helps to locate it; the density is 1e-4 of its maximum beyond."""
 # The band is gathered again when its width has changed by more: 0.45 of the 4.6 ms of a followed frame.
 _BAND_TOLERANCE = 0.05
-_MOVE_TOLERANCE_SIGMA = 0.25
+_MOVE_TOLERANCE_SIGMA = 0.25  # of the edge's blur: the band still holds the edge then; not measured
 _SLOPES_FROM_PX = 6.0
 """Below this radius a plane and the edge cannot be separated: ground and disc are then constant."""
 # Sixty pixels for twelve parameters. Round number; nothing was measured.
@@ -54,9 +54,9 @@ _SHORT_PX, _SHORT_GAIN = 2e-4, 0.02
 _CONVERGED_PX = 2e-3
 # A longer step leaves the band in which the derivative holds.
 _GREATEST_STEP_PX = 3.0
-_GREATEST_BEND = 0.3
+_GREATEST_BEND = 0.3  # of the mean: more turns an ellipse into another one; not measured
 _LEAST_SIGMA_PX = 0.1  # less than the pixel's own blur of 0.29 px: no edge
-_LEAST_CONTRAST_SIGMA = 2.0
+_LEAST_CONTRAST_SIGMA = 2.0  # below it a start is given up; twice this counts as a marker
 # A bound only: two steps are enough for a followed marker, eight for a first one.
 _STEPS = 24
 _GATHERINGS = 12  # a bound only

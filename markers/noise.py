@@ -19,12 +19,12 @@ _DEPTHS_bit = (8, 10, 12, 14, 16)
 # Round number; nothing was measured.
 _BINS = 16
 _LEAST_PIXELS = 1000  # a variance of each of 16 bins is then known to 18 %
-_EDGE_px = 7
-_MEAN_px = 5
+_EDGE_px = 7  # further from an edge than any blur in use; not measured
+_MEAN_px = 5  # a mean of 25 px in two images has 1/7 of a pixel's noise
 _MEANS_PER_DN = 2 * _MEAN_px**2
 """Of two images of whole DN, over squares of so many pixels."""
-_FLAT_PART = 0.02
-_FLAT_SIGMA = 0.5
+_FLAT_PART = 0.02  # of the picture's range; not measured
+_FLAT_SIGMA = 0.5  # of the noise that the mean suggests; not measured
 _ROUNDING_DN2 = 1 / 12  # of a uniform distribution one DN wide
 _TINY_DN = 1e-9
 

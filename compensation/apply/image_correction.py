@@ -67,8 +67,8 @@ _STRIP = 256
 _HELD_ROWS = 128  # of the source, read once for all rows of the result that need them; 128 KB with _STRIP
 _HELD_BANDS = _HELD_ROWS // BLOCK_px
 _NOWHERE = 1 << 40  # further from any row than an image has rows
-SMALLEST_px = 16
-_GREATEST_CHANGE_px = 1.0
+SMALLEST_px = 16  # twice TAPS
+_GREATEST_CHANGE_px = 1.0  # per px of offset change: beyond it the image folds over itself
 _AT = np.uint64
 """Of indices: one that may be negative is looked at twice."""
 

@@ -12,7 +12,7 @@ from thermostand.markers.corner_board import BoardOfCorners
 from thermostand.markers.eccentricity import compute_centroid_offsets_px, compute_disc_centres_by_homography_px
 from thermostand.markers.target import Target
 
-_POINT_mm = 1e-3
+_POINT_mm = 1e-3  # a corner has no size; 1 um keeps the outline's polygon from being empty
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,6 +41,7 @@ def find_perpendiculars(axis: Float) -> Float:
     return np.column_stack([first, make_cross_matrices(axis) @ first])
 
 
+# OpenCV's guess is refined by our own fit; not measured.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 
@@ -81,7 +82,7 @@ def calibrate_opencv(centres_px: Float, points_mm: Float, image_size: tuple[int,
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """The order of a camera's vector: that of OpenCV and mrcal."""
 
-_UNDISTORTIONS, _UNDISTORTED = 30, 1e-14
+_UNDISTORTIONS, _UNDISTORTED = 30, 1e-14  # a bound, and a change far below any marker's noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)

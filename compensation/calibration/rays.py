@@ -19,7 +19,7 @@ from thermostand.compensation.calibration.least_squares import Float
 from thermostand.compensation.calibration.pinhole import Pinhole
 from thermostand.foundation.errors import CalibrationError
 
-DEGREES = (3, 4, 5)
+DEGREES = (3, 4, 5)  # of the polynomials tried; held-out positions choose among them
 # A bound only: Newton's steps end when they are below _PROJECTED_PX.
 _PROJECTIONS = 20
 _PROJECTED_PX = 1e-9  # far below any marker's noise

@@ -114,7 +114,7 @@ _LEAST_TILT_DEG = 10.0
 _ROUNDS = 10  # a bound only: rounds end when chi^2 is settled
 # One in 10^7 markers of normal noise lies beyond 6 sigma in two coordinates; half of it would drop one in a hundred.
 _OUTLIER = 6.0
-_MOST_OUTLIERS = 0.02
+_MOST_OUTLIERS = 0.02  # as for positions of the table (adjustment.py); not measured
 _SETTLED = 0.02  # of chi^2
 _FOLDS = 5  # the usual number; time grows in proportion
 

@@ -198,7 +198,7 @@ def find_warm_up(observations: Observations, moved: Float, session: int) -> Warm
     )
 
 
-_FEWEST = 3
+_FEWEST = 3  # a scatter of two has one degree of freedom
 
 
 def compute_hysteresis_quantities(found: Hysteresis | None, scatter_px: Sequence[float]) -> list[MeasuredQuantity]:
@@ -348,7 +348,7 @@ _SWITCHING_ON = "Switching on"
 _NAMES = ("Drift in the warm-up, I", "Drift in the warm-up, J", "Change of scale in the warm-up")
 _SETTLED = 0.9  # the usual 90 % of a settling time
 _LAST_S = 300.0  # round number; nothing was measured
-_MOST_EXPONENTIALS = 10
+_MOST_EXPONENTIALS = 10  # round number; not measured
 _NO_WARM_UP = "no warm-up was recorded at the reference's place"
 _OF_RESIDUALS = "residuals of a line and exponentials"
 _NO_AIR = "no air temperature near the camera"

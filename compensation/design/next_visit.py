@@ -53,7 +53,7 @@ STEP_S = 60.0  # of the forecast: a quarter of the fastest lag; time grows in in
 # Assumed, not learned from the stand: off by two, the forecast air arrives some minutes early or late.
 _AIR_TAU_S = 300.0
 _AIR_LAGS, _POWER_LAGS = ([lag(of, tau_s) for tau_s in (150.0, 480.0, 1200.0, 4000.0)] for of in (AIR, POWER))
-_RIDGE = 1e-8
+_RIDGE = 1e-8  # keeps the system solvable; features are about 1
 # Time is in inverse proportion to it; readings each few seconds have no more to say of a camera that takes minutes.
 _EVERY_READING = 6
 """Of the camera's readings, for its fit: they come every few seconds, it moves within minutes."""
@@ -213,7 +213,7 @@ _HORIZON_S = 8 * 3600.0
 # Time grows in proportion; each visit is decided again after the one before it.
 _COURSES_PER_KIND = 40
 """Courses of each kind, drawn from the whole grid and from each of its thirds."""
-_THIRDS, _EVERY = 3, 3
+_THIRDS, _EVERY = 3, 3  # round numbers; not measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)

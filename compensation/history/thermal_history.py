@@ -119,7 +119,7 @@ _STEP_NS = 10 * NS_PER_S
 
 # In factors of about three; their weights are fitted to each session.
 _SHAPE_TAUS_S = (40.0, 150.0, 480.0, 1200.0, 4000.0)
-_SHAPE_RIDGE = 1e-10
+_SHAPE_RIDGE = 1e-10  # keeps the system solvable; features are about 1
 _FINE_K, _ROUNDING_K = 0.02, 1e-6
 """A display finer than this needs no refinement; readings closer together than that are the same."""
 # Twelve terms are fitted to them. Round number; nothing was measured.

@@ -44,7 +44,7 @@ from thermostand.foundation.errors import ConfigError
 
 NamedFigure = tuple[str, Figure]
 """The name begins its ids, so that several fit in one page."""
-_ROLLED_DEG = 1.0
+_ROLLED_DEG = 1.0  # round number, not measured; only words of the page hang on it
 
 
 def render_page(

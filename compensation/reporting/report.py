@@ -51,7 +51,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import check_writable, write_atomically
 from thermostand.recording.reading.session import Session
 
-_MOST_PANELS, _MOST_THERMAL = 4, 10
+_MOST_PANELS, _MOST_THERMAL = 4, 10  # what a page holds
 
 
 class NoModel(SessionError):

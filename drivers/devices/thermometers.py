@@ -230,7 +230,7 @@ def _make(name: str, settings: ThermometerModuleSettings, around: DriverContext)
     return modules[0] if len(modules) == 1 else ThermometerModules(modules)
 
 
-_LOOKS, _PERIOD_S = 5, 0.3
+_LOOKS, _PERIOD_S = 5, 0.3  # of stand check: some conversions of the module; not measured
 
 
 async def _compare_thermometers(thermometers: Sensor, regulator: Sensor | None, warn_K: float, clock: Clock) -> Finding:

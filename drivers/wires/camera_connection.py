@@ -137,7 +137,7 @@ def read_temperature(device: GigeDevice, place: TemperatureFeature) -> tuple[flo
 # Aravis' stream: ask again for a missing packet after 1 ms, then every 40 ms, for as much of a frame as was lost.
 INITIAL_PACKET_TIMEOUT_US = 1_000
 PACKET_TIMEOUT_US = 40_000
-PACKET_REQUEST_RATIO = 1.0
+PACKET_REQUEST_RATIO = 1.0  # of a frame's packets: all of them may be asked for again
 FRAME_RETENTION_PERIODS = 0.9  # below 1, so that Aravis gives a frame up before we stop waiting for it
 SOCKET_BUFFER_FIXED = 0
 

@@ -18,7 +18,7 @@ Answer = TypeVar("Answer")
 # As the Modbus bus: longer than a late reply may still take. Round number; nothing was measured.
 _MARGIN_S = 0.05
 _LONGEST_REPLY = 65536  # a device that never ends its reply must not fill the memory
-READ_RETRIES = 2
+READ_RETRIES = 2  # as every read over a wire (xi- and Modbus); not measured
 _FLOW_CONTROL = b"\x11\x13"  # XON and XOFF, which some units send among their replies; 1 and 3 but for one bit
 
 

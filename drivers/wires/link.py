@@ -20,7 +20,7 @@ from thermostand.foundation.errors import Unreachable
 
 _CONNECT_S = 1.0  # round number; nothing was measured
 _WRITE_S = 1.0  # a device that takes no bytes must not hold the caller
-_READ_SIZE = 4096
+_READ_SIZE = 4096  # one read of the kernel; longer replies take several
 CLOSING_S = 0.02  # from a reply to the end of its connection: a round trip of a slow network
 DELIVERY_S = 0.02  # from one end of a pseudo-terminal to the other; 0.1 ms on an idle host
 

@@ -17,7 +17,7 @@ from thermostand.drivers.wires.link import ByteLink, read_reply
 from thermostand.foundation.clock import Now, await_simulated_answers
 from thermostand.foundation.errors import DeviceError, GarbledReply, Refused, Unreachable
 
-READ_RETRIES = 2
+READ_RETRIES = 2  # as every read over a wire; not measured
 _MARK = b"\0"
 _RESYNC_BURSTS = 4  # round number; nothing was measured
 _RESYNC_ZEROS = bytes(64)

@@ -36,7 +36,7 @@ from thermostand.recording.writing.session_spec import make_frames_topic
 
 # Telemetry is committed in blocks of this much: many messages per disk sync, many blocks per segment.
 BLOCK_NS = 60 * NS_PER_S
-BLOCK_BYTES = 1 << 20
+BLOCK_BYTES = 1 << 20  # as a recording commits; not measured
 
 
 def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:

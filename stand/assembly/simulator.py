@@ -21,7 +21,7 @@ from thermostand.stand.config.simulation import SimulatedCamera
 from thermostand.stand.config.stand_config import StandConfig, find_packaged
 
 _STOP_LIMIT_S = 5.0  # round number; nothing was measured
-_CONNECT_S = 5.0
+_CONNECT_S = 5.0  # it listens on this machine; not measured
 _TURN_US = 10_000  # how long the event loop may wait for an answer
 _CAMERA_BOOT_S = 3.0  # a stand that waits for less has a camera that takes less
 _FREE_TCP, _FREE_SERIAL = "tcp:127.0.0.1:0", "serial:"

@@ -11,7 +11,7 @@ from thermostand.foundation.usage import escape_line
 from thermostand.stand.commands.endpoint import ConfigOption
 
 app = App(no_args_is_help=True)
-_LIMIT_S = 20.0
+_LIMIT_S = 20.0  # for an address, as in serving/alerts.py
 
 
 @app.callback()

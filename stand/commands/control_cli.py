@@ -37,7 +37,7 @@ from thermostand.stand.serving.client import API, Answer, Server
 
 app = App()
 
-_WATCH_S = 2.0
+_WATCH_S = 2.0  # a person looks at it; not measured
 _AGAIN_S, _LOOK_S = 2.0, 0.25  # the guard looks once a second
 _LABEL = 14
 _NEW_NS = 10 * NS_PER_S  # slower than any installed stand polls

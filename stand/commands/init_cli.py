@@ -123,7 +123,7 @@ app = App()
 Found = TypeVar("Found")
 
 _AXES = ("linear", "rotary")
-_WAIT_S = 1.0
+_WAIT_S = 1.0  # for cameras to answer; not measured
 _CONTROLLER = re.compile(r"/dev/ximc/([0-9A-Fa-f]{8})")
 _POLOLU = 0x1FFB
 

@@ -153,11 +153,11 @@ def _format_minutes(duration_s: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes / 60.0:.1f} h"
 
 
-_BETWEEN_PANELS_NS = NS_PER_S // 4
-_BETWEEN_LINES_NS = 60 * NS_PER_S
+_BETWEEN_PANELS_NS = NS_PER_S // 4  # what an eye follows
+_BETWEEN_LINES_NS = 60 * NS_PER_S  # of a log that somebody reads later
 _TENTH = 0.1  # of a run in virtual time, whose minutes are none
 _LEAST_S = 1.0  # of stand time between two reports, or a thousandth of the run: terminals are slow
-_SHARE = 1e-3
+_SHARE = 1e-3  # as stated for _LEAST_S
 
 
 @contextmanager

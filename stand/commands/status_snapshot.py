@@ -16,7 +16,7 @@ from thermostand.stand.serving.client import API, Server
 
 # Follows a stand from a daemon's HTTP interface.
 
-_EVENTS = 500
+_EVENTS = 500  # in one answer; the rest is asked for next
 
 EventData = Mapping[str, object]
 

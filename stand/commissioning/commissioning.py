@@ -356,7 +356,7 @@ _PIECES, _PIECE_BYTES = 8, 4_000_000
 _SLOWEST_FLUSH_S = 1.0  # a commit is due each second
 _MARGIN = 2.0  # how much faster than the cameras a disk has to be
 _FRAME_BYTES = 2448 * 2048  # of a camera whose size is not in the stand's file
-_LEAST_MB_s = 10.0
+_LEAST_MB_s = 10.0  # round number; not measured
 
 _UNSYNCHRONISED = 5  # adjtimex(2): TIME_ERROR
 _TIMEX_BYTES = 208

@@ -25,9 +25,9 @@ from thermostand.foundation.items import StepMark, StepState
 from thermostand.recording.reading.session import Session
 from thermostand.stand.config.chamber_section import BAND_K
 
-_ARRIVAL_LEVELS_K = (4.0, 2.0, 1.0, BAND_K)
+_ARRIVAL_LEVELS_K = (4.0, 2.0, 1.0, BAND_K)  # halved each time, down to the band
 _LEAST_RAMP_K = 1.5  # smaller steps drown in the display's 0.1 K
-_HALF_DIGIT_K = 0.05
+_HALF_DIGIT_K = 0.05  # of a display of 0.1 K
 _LEAST_CAMERA_CHANGE_K = 1.0  # within half a dwell; cameras report their temperature in steps of 0.1 to 0.5 K
 _CAMERA_MEAN_S = 60.0  # several such steps are averaged
 _FIT_POINTS = 41  # factors that are tried; round number, nothing was measured

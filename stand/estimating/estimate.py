@@ -32,7 +32,7 @@ from thermostand.stand.estimating.learned_durations import LearnedDurations
 # Off by two, so is what a plan needs of the disk; a disk that gets full stops the frames and never the telemetry.
 _BYTES_PER_PIXEL = {"zstd": 0.573, "raw": 1.0, "roi": 0.103}
 _TELEMETRY_BYTES_PER_MESSAGE = 116.0
-_SENSOR_PX = (2448, 2048)
+_SENSOR_PX = (2448, 2048)  # the paper's camera, where the stand's file has no size
 
 _LONGEST_S = 366 * 86400.0  # a longer plan is a slip of the keyboard, and its end soon beyond any calendar
 

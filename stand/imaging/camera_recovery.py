@@ -14,7 +14,7 @@ from thermostand.stand.imaging.cameras import Cameras
 
 # Round number; nothing was measured.
 LOST_LIMIT_S = 1800.0
-RETRY_S, LONGEST_RETRY_S = 1.0, 10.0
+RETRY_S, LONGEST_RETRY_S = 1.0, 10.0  # doubled between tries; not measured
 
 
 class CameraRecovery:

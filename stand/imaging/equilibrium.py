@@ -29,7 +29,7 @@ from thermostand.stand.imaging.settling import Float, find_digit_K, fit_camera_r
 CAMERA = "camera.temperature"
 # 0.7 % of a step are left then; half of it leaves 8 %, twice holds a run without a temperature for twice as long.
 _TIME_CONSTANTS = 5.0
-_LOOK_S = 10.0
+_LOOK_S = 10.0  # a camera takes minutes
 _UNKNOWN_S = 60.0  # without a reading; a longer gap leaves open what happened in it
 
 

@@ -67,7 +67,7 @@ from thermostand.stand.serving.api.server import preload
 #
 # It remembers nothing: what is read says whether it is done. A run that is resumed here continues it.
 
-_LOOK_S = 10.0
+_LOOK_S = 10.0  # the chamber takes minutes
 _AGAIN_S = 60.0  # after a device that did not do what was commanded
 _FOLLOWS_K = 1.0  # the set-point follows the laboratory in such steps
 

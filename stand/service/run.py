@@ -182,7 +182,7 @@ def _pin_threads(cpus: set[int]) -> None:
 
 # Checked before the first step: the camera's own temperature, without which no frame is of use.
 
-_TRIES, _PAUSE_S = 3, 1.0
+_TRIES, _PAUSE_S = 3, 1.0  # against single readings that fail; not measured
 
 
 async def check_temperature(camera: Camera, hub: Hub, clock: Clock) -> None:

@@ -8,7 +8,7 @@ import socket
 from contextlib import suppress
 
 STOPPING, READY, FED = "STOPPING=1", "READY=1", "WATCHDOG=1"
-_EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0
+_EXTEND_EVERY_S, _EXTENDED_S = 20.0, 60.0  # three tries before systemd gives up
 
 
 def notify_systemd(*lines: str) -> None:

@@ -118,8 +118,8 @@ class AlertTracker:
 
 
 _LIMIT_S = 20.0  # for an address
-_LOOK_S = 0.5
-_BEAT_S = 1.0
+_LOOK_S = 0.5  # how late a message may begin; not measured
+_BEAT_S = 1.0  # 15 of them may fail to come before it is late
 _LATE_NS = to_ns(15.0)  # an event loop that has not come round for so long is not well
 _AGAIN_S = (15.0, 60.0, 300.0, 1200.0)  # after a try that failed: networks come back
 _MOST_WAITING = 100  # round number; nothing was measured

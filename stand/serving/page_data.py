@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from thermostand.stand.serving.preview import Preview
 
 _WAITING = 20_000  # items; the thread takes them every second
-_TAKE_S = 1.0
+_TAKE_S = 1.0  # curves have a point a second
 # Markers of a 5 MP frame take tens of ms; the process has the lowest priority, and the newest frame goes first.
 _SOONEST_S = 0.4  # between two frames that are looked at
 _AGAIN_S = 30.0  # before a process that has ended is started again

@@ -22,7 +22,7 @@ from thermostand.markers.target import Target
 from thermostand.stand.serving.shot import DRIFT_ROLES, FrameShot, Image
 
 _JPEG_QUALITY = 80  # for the page only: the markers are found in the frame itself
-_BINS = 64
+_BINS = 64  # of the page's histogram
 _EDGE_10_90 = 2.5631  # from 10 to 90 % of a Gaussian edge, in its standard deviations
 _CORNER = np.array([(0, 0), (1, 0), (0, 1)])  # mm
 _NEARLY_SQUARE = 0.9995  # foreshortening that noise and pixels that are not quite square can make, too

@@ -26,7 +26,7 @@ from thermostand.foundation.readings import Reading
 from thermostand.foundation.workers import Result, WorkerThread
 
 _LOOKS = 3  # at a state that follows its command a scan of the unit later
-_RENEW_S = 60.0
+_RENEW_S = 60.0  # of a command that the chamber forgets; not measured
 
 
 class _Module(Protocol):

@@ -36,7 +36,7 @@ from thermostand.foundation.documents import Document
 _PERIODS = 4  # that have to agree
 _AGREE = 0.2  # each with their mean: amplitude and period; and the shares with one half
 _LEAST_PERCENT = 2.0  # amplitude of the output with which a limit cycle is still above the noise
-_APPROACH_Tu = 3.0
+_APPROACH_Tu = 3.0  # ultimate periods until the cycle is even; round number, not measured
 
 
 class TuningSettings(Document):

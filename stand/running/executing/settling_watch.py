@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from thermostand.markers.detection import Detection
 
 CHAMBER, CAMERA = "regulator.pv", "camera.temperature"
-_UNKNOWN_S = 60.0
+_UNKNOWN_S = 60.0  # as in imaging/equilibrium.py
 # At most 40,000 pairs of numbers, 0.64 MB for each channel.
 _KEPT = 20_000  # readings, at least: more than a day at one every 5 s
 

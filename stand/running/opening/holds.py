@@ -20,7 +20,7 @@ from thermostand.stand.safety.latch import Latch
 SHUT_AFTER_S = 48.0
 _LOOK_S = 5.0  # who was on the way when the gate closed may open it later
 _CLEARED_WITHIN_S = 1800.0  # by the person who works with a virtual run: some 30 s of real time
-_ENDLESS_LOOK_S = 30.0
+_ENDLESS_LOOK_S = 30.0  # of hours; not measured
 _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be worn
 
 

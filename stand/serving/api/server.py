@@ -30,7 +30,7 @@ from thermostand.stand.serving.instances import DaemonEntry, DaemonInstance
 
 _UNIX: tuple[ListenerKind, ...] = ("socket", "stop")
 _TCP: ListenerKind = "tcp"
-_LOOK_S = 1.0
+_LOOK_S = 1.0  # how late a dead thread is noticed; not measured
 _CLOSE_LIMIT_S = 5.0  # round number; nothing was measured
 _READY_LIMIT_S = 30.0  # imports take half a second or more
 
