@@ -20,7 +20,19 @@ class StepState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StepMark:
-    """A step of the plan began or ended. `parameters` are the step's own fields as JSON-able values."""
+    """A step of the plan began or ended.
+
+    Attributes
+    ----------
+    time_ns
+        The instant, ns of the stand's clock.
+    step_id, index, kind
+        The step's id, its place in the plan from 0, and what it does.
+    state
+        Whether it began, or how it ended.
+    parameters
+        The step's own fields as JSON-able values.
+    """
 
     time_ns: int
     step_id: str
@@ -32,9 +44,19 @@ class StepMark:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something to be known later: a fault, a gap, a trip, the end of a run. level: info, warning or error.
+    """Something to be known later: a fault, a gap, a trip, the end of a run.
 
-    `text` is for people, `kind` and `data` (JSON-able fields) are for programs: nothing is read out of a sentence.
+    Attributes
+    ----------
+    time_ns
+        The instant, ns of the stand's clock.
+    kind, data
+        For programs: a kind of the table of events, and its fields as JSON-able values. Nothing is read out of a
+        sentence.
+    text
+        For people.
+    level
+        "info", "warning" or "error".
     """
 
     time_ns: int

@@ -74,14 +74,31 @@ UNSETTLED = "unsettled"
 class Frame:
     """One image and what belongs to it.
 
-    image: uint8 or uint16, shape (height, width), [row, column], not to be modified. time_ns: middle of the exposure
-    on the stand's clock. camera_degC: the camera's own temperature, NaN when it has none or could not be read.
-    block_id: own 64-bit count of frames of this device since it was opened, gaps included. camera_ticks: the
-    camera's own time stamp, ns. dropped: frames lost since the previous one. step_id: the plan's step that asked
-    for it, "" when none did. windows: x, y, width, height of the parts of the image that were recorded, px, shape
-    (n, 4), the rest is filled; None when the whole image is there. flags: why it is to be left out of fits, in words of
-    letters and _, such as TEMPERATURE_IN_DOUBT. significant_bits: of a sample, 0 for all of its type.
-    described: of a recorded frame, its description as it was recorded, with what was known when it was published.
+    Attributes
+    ----------
+    image
+        uint8 or uint16, (height, width), [row, column]; not to be modified.
+    time_ns
+        Middle of the exposure on the stand's clock, ns.
+    camera_degC
+        The camera's own temperature; NaN when it has none or could not be read.
+    block_id
+        The device's own 64-bit count of frames since it was opened, gaps included.
+    camera_ticks
+        The camera's own time stamp, ns.
+    dropped
+        Frames lost since the previous one.
+    step_id
+        The plan's step that asked for it, "" when none did.
+    windows
+        (n, 4): x, y, width, height of the parts of the image that were recorded, px; the rest is filled. None when the
+        whole image was recorded.
+    flags
+        Why it is to be left out of fits, in words of letters and _, such as TEMPERATURE_SUSPECT.
+    significant_bits
+        Of a sample, 0 for all of its type.
+    described
+        Of a recorded frame, its description as it was recorded, with what was known when it was published.
     """
 
     channel: str

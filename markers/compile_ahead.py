@@ -22,7 +22,7 @@ def compile_ahead(tell: Callable[[], None]) -> None:
     nothing, reach = EdgeState(np.empty((0, PARAMETERS)), np.empty(0)), np.empty((0, 2))
     with install_listener("numba:compile", _CompileListener(tell)):
         fit_edges(picture, nothing, Noise(), reach)
-        refit_edges(picture, nothing, np.empty((0, 4)), Noise(), reach, patience=1.0, band_sigma=9.0)
+        refit_edges(picture, nothing, np.empty((0, 4)), Noise(), reach, tolerance=1.0, band_sigma=9.0)
 
 
 class _CompileListener(Listener):

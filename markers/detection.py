@@ -342,14 +342,32 @@ _FLAT_PART = 0.25
 class Detection:
     """The N markers of a target in one image, marker n at index n - 1.
 
-    centres_px: (N, 2) float64 (x, y), NaN without a centre. covariance_px2: (N, 2, 2), NaN likewise. flags: (N,) uint8
-    of Flag, 0 when nothing is wrong. chi: (N,), residual over expected noise; 1 is right, NaN without a centre.
-    homography: (3, 3), target mm -> px. state: the fitted edges, the start of the next frame. growth: (2,), by what the
-    variances along x and y exceed, or fall below, those of residuals that are independent of each other (sandwich.py).
-    excess_px2: (2,), what misfit of ground and disc adds to them, px^2. band_sigma: half width of the band of pixels
-    fitted, in blurs (below). The next frame keeps these two. is_suspect: the noise model does not describe the
-    picture (compression, texture, print, flicker): the covariance is an estimate from how its residuals hang together.
-    is_orientation_assumed: nothing says which way up the target is (Target.orientation): half a turn looks the same.
+    Attributes
+    ----------
+    centres_px
+        (N, 2) float64 as (x, y), px; NaN without a centre.
+    covariance_px2
+        (N, 2, 2), px^2; NaN likewise.
+    flags
+        (N,) uint8, bits of `Flag`; 0 when nothing is wrong.
+    chi
+        (N,), residual over expected noise; 1 is right, NaN without a centre.
+    homography
+        (3, 3), from mm on the target to px.
+    state
+        The fitted edges, the start of the next frame.
+    growth
+        (2,), by what the variances along x and y exceed, or fall below, those of residuals that are independent of each
+        other (sandwich.py).
+    excess_px2
+        (2,), what misfit of ground and disc adds to them, px^2.
+    band_sigma
+        Half width of the band of pixels fitted, in blurs; like `growth` it is kept for the next frame.
+    is_suspect
+        The noise model does not describe the picture (compression, texture, print, flicker): the covariance is an
+        estimate from how its residuals are correlated.
+    is_orientation_assumed
+        Nothing says which way up the target is (`Target.orientation`): half a turn looks the same.
     """
 
     centres_px: Float
@@ -624,14 +642,14 @@ def _refit_poor(detection: Detection, fit: EdgeFit, picture: Picture, target: Ta
         return detection
     usual = float(np.median(fit.chi[clean]))
     scaled = Noise(noise.floor_DN2 * usual**2, noise.slope_DN * usual**2)
-    patience = float(np.median(fit.misfit[clean])) / usual
+    tolerance = float(np.median(fit.misfit[clean])) / usual
     again = refit_edges(
         picture,
         implied.state,
         implied.spread,
         scaled,
         _get_reach(target)[poor],
-        patience=patience,
+        tolerance=tolerance,
         band_sigma=detection.band_sigma,
     )
     credible = (again.chi < _POOR_CHI) & _has_contrast(again.state, target, scaled)

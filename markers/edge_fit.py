@@ -38,7 +38,13 @@ _SATURATED_PART = 0.1  # round number; nothing was measured
 
 
 class Flag(IntFlag):
-    """What is wrong with a marker; 0 is nothing. MISSING: it has no centre; other flags may say why."""
+    """What is wrong with a marker; 0 is nothing.
+
+    Attributes
+    ----------
+    MISSING
+        It has no centre; other flags may say why.
+    """
 
     OK = 0
     POOR_FIT = 1

@@ -29,7 +29,23 @@ _NO_IMAGE = (OSError, ValueError, SyntaxError, LookupError, EOFError, OverflowEr
 
 
 def read_image(path: Path | str) -> Image:
-    """Read a grey image (height, width) of 8 or 16 bits; DetectionError when it cannot be read or is too large."""
+    """Read an image of 8 or 16 bits as grey; colour gives its luminance.
+
+    Parameters
+    ----------
+    path
+        A file that OpenCV reads, such as PNG or TIFF.
+
+    Returns
+    -------
+    Image
+        (height, width), [row, column], uint8 or uint16.
+
+    Raises
+    ------
+    DetectionError
+        When it cannot be read, has another type or shape, or is too large.
+    """
     try:
         data = Path(path).read_bytes()
     except OSError as error:

@@ -53,10 +53,10 @@ class Refit:
 
 
 def refit_edges(
-    image: Picture, start: EdgeState, spread: Float, noise: Noise, reach: Float, *, patience: float, band_sigma: float
+    image: Picture, start: EdgeState, spread: Float, noise: Noise, reach: Float, *, tolerance: float, band_sigma: float
 ) -> Refit:
     """Fit markers from the ellipses `start` that the others imply. spread: (N, 4), standard deviations of their m11,
-    m12, m22 and sigma. noise: such that clean markers have chi 1. patience: how much more than noise clean markers'
+    m12, m22 and sigma. noise: such that clean markers have chi 1. tolerance: how much more than noise clean markers'
     outlines deviate from ellipses, 1 for perfect ones. band_sigma: half width of the band, blurs."""
     count = len(start.scale_px)
     parameters = np.ascontiguousarray(start.parameters).copy()
@@ -64,7 +64,7 @@ def refit_edges(
     # A copy of `reach`: read-only memory would be another type to the compiler.
     starts = Starts(parameters, start.scale_px, np.array(reach, np.float64))
     setting = make_setting(image, start, noise, band_sigma)
-    _refit_all(setting, starts, 1 / spread**2, _GREATEST_MISFIT * max(patience, 1.0), covariance, chi)
+    _refit_all(setting, starts, 1 / spread**2, _GREATEST_MISFIT * max(tolerance, 1.0), covariance, chi)
     return Refit(EdgeState(parameters, start.scale_px), covariance, chi)
 
 

@@ -233,5 +233,21 @@ class Target(Document):
 
 
 def load_target(path: Path | str) -> Target:
-    """Load the target that a YAML file describes; ConfigError names the file and the path in it."""
+    """Load the target that a YAML file describes.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    Target
+        The target.
+
+    Raises
+    ------
+    ConfigError
+        Which names the file and the key in it, when it cannot be read or something in it is wrong.
+    """
     return load_document(Path(path), Target)

@@ -17,8 +17,17 @@ _POINT_mm = 1e-3  # a corner has no size; 1 um keeps the outline's polygon from 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Board:
-    """Marker centres (N, 3) in the target's frame (X right, Y up, Z towards the camera), mm, with the standard
-    uncertainty of each coordinate (N, 3), mm, and the diameters (N,), mm."""
+    """The centres of a board's markers, with what is known of them.
+
+    Attributes
+    ----------
+    points_mm
+        Marker centres (N, 3) in the target's frame, mm: X right, Y up, Z towards the camera.
+    sigma_mm
+        Standard uncertainty of each coordinate (N, 3), mm.
+    diameters_mm
+        Diameters (N,), mm.
+    """
 
     points_mm: Float
     sigma_mm: Float

@@ -170,10 +170,21 @@ are a weaker sign: of one lens they were 1.51 times, where held-out positions ga
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """The result. scores: of all models at held-out positions, none when too few are left to tell. model: the pinhole
-    in use. uncertainty, halves: at the mean distance of the target; halves is None when one of them determines no
-    camera. not_known: of scores and halves, why they are not known. rays_times: what the rays leave over what the
-    pinhole leaves."""
+    """A camera and its table, as calibrated from one or several sessions.
+
+    Attributes
+    ----------
+    scores
+        Scores of all models at held-out positions; none when too few are left to tell.
+    model
+        The pinhole in use.
+    uncertainty, halves
+        At the mean distance of the target; `halves` is None when one of them determines no camera.
+    not_known
+        Of `scores` and `halves`, why they are not known.
+    rays_times
+        RMS that the rays leave over RMS that the pinhole leaves.
+    """
 
     adjustment: Adjustment
     rays: RayLens

@@ -147,9 +147,21 @@ class UncertaintyPart(Document):
 
 
 class CameraFile(Document):
-    """A calibrated camera. names, vector: fx fy cx cy (px) and the distortion; covariance: of the vector, then a step
-    of the table (c mm, l, a, R0 rad, o mm). scores: none when they are not known; not_known: which checks, and why.
-    rays_warning: why there are no rays, or why not to use them; "" when they describe the lens."""
+    """A calibrated camera, as its file holds it.
+
+    Attributes
+    ----------
+    names, vector
+        Names and values of fx, fy, cx, cy (px) and of the distortion.
+    covariance
+        Covariance of `vector`, then of a step of the table (c mm, l, a, R0 rad, o mm).
+    scores
+        RMS at held-out positions; none when it is not known.
+    not_known
+        Which checks are not known, and why.
+    rays_warning
+        Why the file has no rays, or why not to use them; "" when they describe the lens.
+    """
 
     format: Literal["thermostand camera"] = FORMAT
     schema_version: Literal[1] = 1
@@ -243,7 +255,23 @@ class CameraFile(Document):
 
 
 def load_camera(path: Path | str) -> CameraFile:
-    """Load the camera from a file that `save` wrote, number for number; SessionError when it is anything else."""
+    """Load the camera from a file that `save` wrote, number for number.
+
+    Parameters
+    ----------
+    path
+        The JSON file.
+
+    Returns
+    -------
+    CameraFile
+        The camera.
+
+    Raises
+    ------
+    SessionError
+        When it is anything else, or of another version.
+    """
     return load_json(
         path, lambda text: CameraFile.model_validate_json(text, strict=True).check_sound(), "a camera file"
     )

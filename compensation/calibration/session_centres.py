@@ -116,8 +116,17 @@ _LEAST_POSITIONS = 5  # round number; nothing was measured
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """P pictures with the N markers of a board. centres_px (P, N, 2): of the outlines, NaN where not seen.
-    covariance_px2 (P, N, 2, 2). image_size: (width, height), px."""
+    """P pictures with the N markers of a board.
+
+    Attributes
+    ----------
+    centres_px
+        (P, N, 2) as (x, y), centres of the outlines, px; NaN where not seen.
+    covariance_px2
+        (P, N, 2, 2), px^2; NaN likewise.
+    image_size
+        (width, height), px.
+    """
 
     centres_px: Float
     covariance_px2: Float
@@ -143,9 +152,19 @@ class Views:
 class Positions(Views):
     """Views at P table positions, each the mean of some frames.
 
-    linear_mm, rotary_deg (P,). centres_px: NaN where a marker was missing or flagged in every frame. frames (P,):
-    frames averaged. flags (P, N) uint8: all flags of the frames. chi: scatter of the frames about their mean over the
-    scatter the detections' covariances predict, NaN with one frame each.
+    Attributes
+    ----------
+    linear_mm, rotary_deg
+        (P,), where the table was.
+    centres_px
+        (P, N, 2) as (x, y), px; NaN where a marker was missing or flagged in every frame.
+    frames
+        (P,), frames averaged.
+    flags
+        (P, N) uint8, all flags of the frames.
+    chi
+        Scatter of the frames about their mean over the scatter that the detections' covariances predict; NaN with one
+        frame each.
     """
 
     linear_mm: Float
@@ -161,9 +180,28 @@ class Positions(Views):
 
 
 def observe_positions(session: Session, target: Target, report: Report | None = None) -> Positions:
-    """Find the target in the calibration frames of a session; `report` counts them.
+    """Find the target in the calibration frames of a session.
 
-    SessionError when it has none. CalibrationError when too few show enough of the target.
+    Parameters
+    ----------
+    session
+        A session with frames of the role CALIBRATION.
+    target
+        The target that they show.
+    report
+        Is called with the number of each frame and a text about it; None shows nothing.
+
+    Returns
+    -------
+    Positions
+        A view for each position of the table, the mean of its frames.
+
+    Raises
+    ------
+    SessionError
+        When the session has no such frames.
+    CalibrationError
+        When too few show enough of the target.
     """
     visits = list_visits(session.steps(), {ROLE})
     if not visits:

@@ -29,8 +29,13 @@ ERRORS = 6
 class TableSigma:
     """Standard uncertainties of the table at a position; 0 takes that degree of freedom as exact.
 
-    linear_mm and rotary_arcmin: of the recorded positions; the defaults are the resolutions the paper names for its
-    table (0.31 um, 0.6 arcmin) and what a microstepping drive adds. straightness_mm and wobble_arcmin: across the axes.
+    Attributes
+    ----------
+    linear_mm, rotary_arcmin
+        Of the recorded positions; the defaults are the resolutions that the paper names for its table (0.31 um, 0.6
+        arcmin) and what a microstepping drive adds.
+    straightness_mm, wobble_arcmin
+        Across the axes.
     """
 
     linear_mm: float = 0.0005

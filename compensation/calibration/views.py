@@ -135,8 +135,17 @@ class PosedScene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewCalibration:
-    """covariance: of a step of lens, views and board points, in this order. residuals_px (P, N, 2): computed minus
-    measured, NaN where not used. discrepancy_px: what noise and board leave unexplained per coordinate."""
+    """A camera calibrated from views of a board.
+
+    Attributes
+    ----------
+    covariance
+        Of a step of lens, views and board points, in this order.
+    residuals_px
+        (P, N, 2), computed minus measured, px; NaN where not used.
+    discrepancy_px
+        What noise and board leave unexplained per coordinate, px.
+    """
 
     scene: PosedScene
     board: Board
@@ -182,10 +191,26 @@ def calibrate_views(views: Views, board: Board) -> ViewCalibration:
 
     Rounds follow until the eccentricity of the discs, the outliers and the discrepancy are settled.
 
+    Parameters
+    ----------
+    views
+        Pictures of the board in different poses.
+    board
+        Its marker centres, with their uncertainty.
+
+    Returns
+    -------
+    ViewCalibration
+        The lens, the poses and the adjusted board, with their covariance.
+
     Raises
     ------
     CalibrationError
         When the views are too few or too alike to determine a camera.
+
+    References
+    ----------
+    D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37 (1971).
     """
     if len(views.centres_px) < LEAST_VIEWS:
         raise CalibrationError(f"{len(views.centres_px)} pictures show the target, {LEAST_VIEWS} are needed")

@@ -24,10 +24,21 @@ paper's form only (states_of)."""
 
 
 class Outside(IntFlag):
-    """Why a correction is an extrapolation. PLACE: beyond the hull of the markers (plus 1 px). CAMERA: the camera's
-    temperature. AMBIENT: the air's. SWITCHED_ON: the camera was switched
-    on more recently than ever in the calibration. HISTORY: the record does not reach back far enough, or has a gap.
-    STATE: each of these is in its range, but not in this combination."""
+    """Why a correction is an extrapolation.
+
+    Attributes
+    ----------
+    PLACE
+        The point is beyond the hull of the markers (plus 1 px).
+    CAMERA, AMBIENT
+        The camera's temperature, or the air's, is outside the calibrated range.
+    SWITCHED_ON
+        The camera was switched on more recently than ever in the calibration.
+    HISTORY
+        The record does not reach back far enough, or has a gap.
+    STATE
+        Each of these is in its range, but not in this combination.
+    """
 
     PLACE = 1
     CAMERA = 2
@@ -39,12 +50,23 @@ class Outside(IntFlag):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DriftModel(ABC):
-    """Maps measured positions of one camera to those at the reference temperature; made by model_selection.fit,
-    saved and loaded by model_file.
+    """The drift of one camera: maps measured positions to those at the reference temperature.
 
-    form: paper or thermal. facts: what it was fitted to. discrepancy_px (2,): what the form leaves unexplained at
-    temperatures not fitted, one standard deviation, marker noise taken off. candidates: the table of choice, of every
-    form tried. other: the other form, fitted to the same frames; None when they could not support it.
+    `thermostand.fit` makes one, `load_model` and `save_model` read and write it.
+
+    Attributes
+    ----------
+    form
+        "paper" or "thermal".
+    facts
+        What it was fitted to.
+    discrepancy_px
+        (2,), one standard deviation along x and y: what the form leaves unexplained at temperatures not fitted, marker
+        noise taken off, px.
+    candidates
+        The table of choice, with every form tried.
+    other
+        The other form, fitted to the same frames; None when they could not support it.
     """
 
     form: ClassVar[str]
@@ -65,14 +87,40 @@ class DriftModel(ABC):
 
     @abstractmethod
     def shift(self, xy_px: Float, state: Situation) -> Float:
-        """Displacement (N, 2), px, to the reference of points (N, 2) measured in these states. Outside the valid range
-        it extrapolates: ask `flags`. NaN in, and an unknown state, NaN out."""
+        """Return the displacement to the reference of points measured in these states.
+
+        Parameters
+        ----------
+        xy_px
+            Points (N, 2) as (x, y), px; integers are pixel centres.
+        state
+            The camera's thermal state: one for all points, or one for each.
+
+        Returns
+        -------
+        Float
+            (N, 2), px; NaN where a point or its state is NaN. Outside the valid range it extrapolates: ask `flags`.
+        """
 
     def correct(self, xy_px: Float, state: Situation) -> Float:
-        """Return where the points (N, 2), px, would be at the reference; NaN where a point, or one of several states,
-        is NaN.
+        """Return where the points would be at the reference.
 
-        ValueError when not a single point has an answer, as in states that are not known.
+        Parameters
+        ----------
+        xy_px
+            Points (N, 2) as (x, y), px; integers are pixel centres.
+        state
+            The camera's thermal state: one for all points, or one for each.
+
+        Returns
+        -------
+        Float
+            (N, 2), px; NaN where a point, or one of several states, is NaN.
+
+        Raises
+        ------
+        ValueError
+            When not a single point has an answer, as in states that are not known.
         """
         points = check_points(xy_px)
         corrected = points + self.shift(points, state)
@@ -83,7 +131,13 @@ class DriftModel(ABC):
 
     @abstractmethod
     def covariance(self, xy_px: Float, state: Situation) -> Float:
-        """Covariance (N, 2, 2), px^2, of `shift`, without the noise of the point itself."""
+        """Return the covariance of `shift`, without the noise of the point itself.
+
+        Returns
+        -------
+        Float
+            (N, 2, 2), px^2; NaN where `shift` is.
+        """
 
     def of_sessions(self, session_ids: Iterable[str]) -> Self:
         """The model for these sessions: `covariance` holds for any session, and is smaller for those that were fitted
@@ -92,10 +146,16 @@ class DriftModel(ABC):
 
     @abstractmethod
     def flags(self, xy_px: Float, state: Situation) -> Flags:
-        """(N,): of Outside; 0 is a correction as good as `covariance` says."""
+        """Return why each correction is an extrapolation.
+
+        Returns
+        -------
+        Flags
+            (N,), bits of `Outside`; 0 is a correction as good as `covariance` says.
+        """
 
     def inside(self, xy_px: Float, state: Situation) -> Mask:
-        """(N,): whether points and states are in the calibrated range: no flag."""
+        """Return whether points and states are in the calibrated range, (N,): no flag."""
         return self.flags(xy_px, state) == 0
 
 

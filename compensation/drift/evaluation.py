@@ -46,11 +46,28 @@ class TemperatureRms:
 class Evaluation:
     """Deviations of held-out centres from their reference positions, before and after compensation.
 
-    method: what was held out, in words. frames: how many. before_px, after_px (M, 2): reference minus measured, and
-    reference minus corrected. rows: the M centres. claimed_px2 (M, 2): variance of the deviations after, as model and
-    markers claim it. outside (M,): beyond the model's valid range. coverage_95 (I, J): part of the deviations
-    after that lie in the 95 % interval the model and the markers claim; 0.95 is right. temperatures: one per set-point.
-    simulated: whether the frames are known to be of a simulated laboratory.
+    Attributes
+    ----------
+    method
+        What was held out, in words.
+    frames
+        How many frames.
+    before_px, after_px
+        (M, 2), px: reference minus measured, and reference minus corrected.
+    rows
+        The M centres.
+    claimed_px2
+        (M, 2), px^2: variance of the deviations after, as model and markers claim it.
+    outside
+        (M,): beyond the model's valid range.
+    coverage_95
+        Along I and J, the part of the deviations after that lie in the 95 % interval which model and markers claim;
+        0.95
+        is right.
+    temperatures
+        One score for each set-point.
+    simulated
+        Whether the frames are known to be of a simulated laboratory.
     """
 
     method: str
@@ -81,6 +98,18 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
 
     Sessions without any are scored by leaving out one temperature at a time, each time with a new fit of the same
     terms.
+
+    Parameters
+    ----------
+    model
+        What `fit` or `load_model` gave.
+    observations
+        Frames of the same camera and target.
+
+    Returns
+    -------
+    Evaluation
+        Deviations before and after compensation.
 
     Raises
     ------

@@ -133,12 +133,41 @@ _ANY: TypeAdapter[PaperFile | ThermalFile] = TypeAdapter(
 
 
 def save_model(model: DriftModel, path: Path | str) -> None:
-    """Write the model as JSON, whole or not at all; SessionError when the place refuses."""
+    """Write the model as JSON, whole or not at all.
+
+    Parameters
+    ----------
+    model
+        What `fit` gave.
+    path
+        The file; one that exists is replaced.
+
+    Raises
+    ------
+    SessionError
+        When the place refuses.
+    """
     write_atomically(Path(path), _build_document(model).model_dump_json(indent=1) + "\n")
 
 
 def load_model(path: Path | str) -> DriftModel:
-    """Load the model from a file that `save_model` wrote, number for number; SessionError when it is anything else."""
+    """Load the model from a file that `save_model` wrote, number for number.
+
+    Parameters
+    ----------
+    path
+        The JSON file.
+
+    Returns
+    -------
+    DriftModel
+        The model.
+
+    Raises
+    ------
+    SessionError
+        When it is anything else, or of another version.
+    """
     return load_json(path, lambda text: _build_model(_ANY.validate_json(text, strict=True)), "a drift model")
 
 

@@ -57,8 +57,16 @@ class ThermalStateSpec:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """A camera's thermal state at F instants. rows (F, 3 + P + 2): camera, air and supply, the P lags and plays of
-    `memory`, then on_s and settled_s. NaN where unknown."""
+    """A camera's thermal state at F instants.
+
+    Attributes
+    ----------
+    rows
+        (F, 3 + P + 2): camera, air and supply, the P lags and plays of `memory`, then `on_s` and `settled_s`; NaN where
+        unknown.
+    memory
+        Which lags and plays these are.
+    """
 
     memory: ThermalStateSpec
     rows: Float

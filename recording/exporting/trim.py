@@ -40,13 +40,27 @@ BLOCK_BYTES = 1 << 20  # as a recording commits; not measured
 
 
 def trim(session: Session, out: Path, begin_ns: int, end_ns: int) -> Path:
-    """Write what was recorded in [begin_ns, end_ns) as the new session `out`, which must not exist; return `out`.
+    """Write what was recorded in a range of time as a new session.
 
     Attachments, channels, sequence numbers, instants and order stay, and so do the metadata, which state the extent of
     the part and what was already missing in the session. The first messages are an event of kind
     TRIMMED, when a step had started and not ended before `begin_ns` its mark again, and when UTC was not the stand's
     time an event that says so, all at the instant of the first message kept: a frame's step can be looked up, and
     nothing lies before the part.
+
+    Parameters
+    ----------
+    session
+        The session, which is not changed.
+    out
+        The new session's folder, which must not exist.
+    begin_ns, end_ns
+        The range [begin_ns, end_ns), ns of the session's clock.
+
+    Returns
+    -------
+    Path
+        `out`.
 
     Raises
     ------

@@ -27,15 +27,30 @@ _AIR = "thermometers.air"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramesTable:
-    """F frames in order of time; each column has shape (F,).
+    """F frames in order of time; each column has shape (F,). Numbers are NaN when unknown.
 
-    file: the segment that holds the image, within the session. time_ns: middle of the exposure, int64. camera:
-    whose it is, "" when unknown. step_id: the step that took it, role: what for, as the step says, "" when neither
-    is known. superseded: whether its capture was begun again after it, so that it does not count. chamber_degC: the
-    step's set-point. camera_degC: the camera's own temperature. flags: why it is to be left out of fits
-    (foundation.readings.Frame), with a comma between them, "" when for no reason. air_degC: near the camera,
-    interpolated. positions: of each axis of the table, by its name, in its unit (mm or deg), interpolated. Numbers are
-    NaN when unknown.
+    Attributes
+    ----------
+    file
+        The segment that holds the image, within the session.
+    time_ns
+        Middle of the exposure, int64.
+    camera
+        Whose it is, "" when unknown.
+    step_id, role
+        The step that took it, and what for, as the step says; "" when unknown.
+    superseded
+        Whether its capture was begun again after it, so that it does not count.
+    chamber_degC
+        The step's set-point.
+    camera_degC
+        The camera's own temperature.
+    flags
+        Why it is to be left out of fits (`Frame.flags`), with a comma between them; "" when for no reason.
+    air_degC
+        Near the camera, interpolated.
+    positions
+        Of each axis of the table, by its name, in its unit (mm or deg), interpolated.
     """
 
     file: NDArray[np.str_]

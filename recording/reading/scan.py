@@ -290,9 +290,24 @@ def _no_report(share: float, text: str) -> None:
 
 
 def verify(path: Path, report: Report = _no_report) -> Scan:
-    """Read every byte of the session in `path`. Damage is not raised, it is among the findings of the result.
+    """Read every byte of a session and judge it.
 
-    `report` gets the bytes read so far and the segment. SessionError when `path` is no session.
+    Parameters
+    ----------
+    path
+        The session's folder.
+    report
+        Is called with the bytes read so far and the segment.
+
+    Returns
+    -------
+    Scan
+        What was found. Damage is not raised, it is among the findings of the result.
+
+    Raises
+    ------
+    SessionError
+        When `path` is no session.
     """
     return scan(path, Depth.BYTES, report)
 

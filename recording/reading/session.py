@@ -70,9 +70,17 @@ Say = Callable[[str], None]
 
 
 class Session:
-    """A session directory. Of its segments those in `incomplete` were not finished, those in `damaged` were replaced
-    by what could be salvaged from them; both are not read. `camera`: whose frames are meant where those of one camera
-    are, by its name; the leading one's unless it is set."""
+    """A recorded session, read from its folder.
+
+    Attributes
+    ----------
+    incomplete
+        Segments that were not finished; they are not read.
+    damaged
+        Segments that were replaced by what could be recovered from them; they are not read.
+    camera
+        The name of the camera whose frames are meant where those of one camera are; the leading one's unless it is set.
+    """
 
     camera = "camera"
 
@@ -149,8 +157,24 @@ class Session:
         return {channel: self._units[channel] for channel in self.channels()}
 
     def readings(self, channel: str) -> ChannelColumn:
-        """(time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD; `.to_pandas()` is a
-        Series of it. SessionError when the session has no such channel."""
+        """Return the readings of a channel.
+
+        Parameters
+        ----------
+        channel
+            Its name, one of `channels()`.
+
+        Returns
+        -------
+        ChannelColumn
+            (time_ns, value), both of shape (n,), in order of time; NaN where the reading was BAD. `.to_pandas()` is a
+            Series.
+
+        Raises
+        ------
+        SessionError
+            When the session has no such channel.
+        """
         device = channel.partition(".")[0]
         if device not in self._columns and not self._all_columns_read:
             self._columns[device] = self._read_columns(device).get(device, {})
@@ -232,7 +256,18 @@ class Session:
         return SessionArrays(self, list(self._iterate_places()), lambda: self.utc)
 
     def frame(self, index: int) -> Frame:
-        """The frame of that index, counted from 0 in order of time; SessionError when there is none."""
+        """Return one frame, decoded.
+
+        Parameters
+        ----------
+        index
+            Counted from 0 in order of time.
+
+        Raises
+        ------
+        SessionError
+            When the session has no frame of that index, or it cannot be read.
+        """
         if not 0 <= index < self.frame_count:
             raise SessionError(f"{self.path}: has no frame {index}; it has {self.frame_count}, counted from 0")
         if not self._is_in_order:

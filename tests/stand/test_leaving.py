@@ -70,12 +70,12 @@ def took_s(work: Callable[[Callable[[], None]], Coroutine[Any, Any, None]]) -> f
 def test_waits_one_after_the_other_end_with_their_budget():
     async def leave(hung: Callable[[], None]) -> None:
         hung()
-        patience, never = ShutdownDeadline(3.0), asyncio.get_running_loop().create_future()
-        patience.begin()
+        deadline, never = ShutdownDeadline(3.0), asyncio.get_running_loop().create_future()
+        deadline.begin()
         for _ in range(5):
-            assert not await patience.wait(never, 2.0)
-        patience.begin()  # begins once
-        assert patience.limit_s(9.0) == LEAST_S
+            assert not await deadline.wait(never, 2.0)
+        deadline.begin()  # begins once
+        assert deadline.limit_s(9.0) == LEAST_S
 
     assert took_s(leave) == pytest.approx(3.0 + 3 * LEAST_S)  # 2 s, 1 s, and the least of three more
 
@@ -84,10 +84,10 @@ def test_a_wait_under_way_ends_with_a_budget_that_begins_later():
     async def leave(hung: Callable[[], None]) -> None:
         hung()
         loop = asyncio.get_running_loop()
-        patience, never = ShutdownDeadline(3.0), loop.create_future()
-        assert not await patience.wait(never, 1.0)  # no budget yet: its own limit
-        loop.call_later(10.0, patience.begin)
-        assert not await patience.wait(never, 60.0)
+        deadline, never = ShutdownDeadline(3.0), loop.create_future()
+        assert not await deadline.wait(never, 1.0)  # no budget yet: its own limit
+        loop.call_later(10.0, deadline.begin)
+        assert not await deadline.wait(never, 60.0)
 
     assert took_s(leave) == pytest.approx(1.0 + 10.0 + 3.0)
 
@@ -95,10 +95,10 @@ def test_a_wait_under_way_ends_with_a_budget_that_begins_later():
 def test_what_has_ended_is_not_waited_for():
     async def leave(hung: Callable[[], None]) -> None:
         hung()
-        patience, work = ShutdownDeadline(), asyncio.get_running_loop().create_future()
+        deadline, work = ShutdownDeadline(), asyncio.get_running_loop().create_future()
         work.set_result(None)
-        assert await patience.wait(work, 0.0)
-        assert await patience.wait(asyncio.ensure_future(asyncio.sleep(0.5)), 9.0)
+        assert await deadline.wait(work, 0.0)
+        assert await deadline.wait(asyncio.ensure_future(asyncio.sleep(0.5)), 9.0)
 
     assert took_s(leave) == pytest.approx(0.5)
 

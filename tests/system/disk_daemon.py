@@ -64,15 +64,15 @@ async def main(directory):
         say(time.monotonic(), recorder.saved.frames, recorder.saved.telemetry, age_s, recorder.folder_lost)
         await asyncio.sleep(0.02)
     publishing.cancel()
-    patience = ShutdownDeadline()
-    patience.begin()
+    deadline = ShutdownDeadline()
+    deadline.begin()
     try:
         try:
-            await log.end(Ended(0, "stopped", "stopped"), patience)
+            await log.end(Ended(0, "stopped", "stopped"), deadline)
         finally:
             recording.cancel()
             await asyncio.wait([recording])
-            await recorder.finish(FINISH_WITHIN_S / 4, patience)
+            await recorder.finish(FINISH_WITHIN_S / 4, deadline)
     finally:
         disk.close()
 
