@@ -39,15 +39,15 @@ class Visit:
     soak_s: float
 
 
-class Enough:
+class CycleComplete:
     """A decision: enough is known."""
 
 
-class Undecided:
+class DecisionPending:
     """There was no decision; the fixed plan goes on."""
 
 
-Answer = Visit | Enough | Undecided
+Answer = Visit | CycleComplete | DecisionPending
 
 
 def begin_cycle(
@@ -88,9 +88,9 @@ def plan_fixed_visits(decide: Decide) -> tuple[Step, ...]:
 def apply_decision(decide: Decide, answer: Answer) -> tuple[Step, ...]:
     """Return what follows that `Decide` instead of `plan_fixed_visits`."""
     match answer:
-        case Enough():
+        case CycleComplete():
             return _plan_validations(decide, decide.unvalidated_degC)
-        case Undecided():
+        case DecisionPending():
             first, rest = decide.set_points_degC[:1], decide.set_points_degC[1:]
             steps = tuple(step for degC in first for step in _plan_visit(decide, degC, decide.soak_s))
             unvalidated = tuple(degC for degC in decide.unvalidated_degC if degC not in first)

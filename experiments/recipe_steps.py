@@ -50,7 +50,7 @@ class RecipeStep:
     step: Step
 
 
-class Nothing(Document):
+class NoParameters(Document):
     """A step without parameters."""
 
 
@@ -109,7 +109,7 @@ def _make_entry_model(step: type[Step]) -> type[Document]:
 
 
 def _get_form(step: type[Step]) -> Any:
-    return Nothing if step.form is None else step.form
+    return NoParameters if step.form is None else step.form
 
 
 def _needs_value(step: type[Step]) -> bool:

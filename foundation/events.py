@@ -185,7 +185,7 @@ def make_alert(event: Event) -> Alert | None:
     return row.make_alert(event.data)
 
 
-def must_be_heard(event: Event) -> bool:
+def is_urgent(event: Event) -> bool:
     """Return whether somebody has to act on it at once, or a run waits for it: it stays as grave as it is, however
     often."""
     if event.data.get("action") in ("abort", "hold"):

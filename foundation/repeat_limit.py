@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from thermostand.foundation.clock import NS_PER_S
-from thermostand.foundation.events import KINDS, EventKind, get_state_change, must_be_heard
+from thermostand.foundation.events import KINDS, EventKind, get_state_change, is_urgent
 from thermostand.foundation.items import Event
 
 # Round numbers; nothing was measured.
@@ -59,7 +59,7 @@ class RepeatLimit:
         if row is not None and (state := get_state_change(event)) is not None:
             return self._admit_state(event, row, self._states.setdefault(state, _StateRepeats()))
         is_limited = event.level != "info" or (row is not None and row.is_limited)
-        if not is_limited or must_be_heard(event):
+        if not is_limited or is_urgent(event):
             return event
         admitted = self._admit_sentence(event)
         if row is not None and row.counts:

@@ -170,6 +170,6 @@ def average_over_markers(values: Float) -> Float:
     return np.where(count[:, None] > 0, np.nansum(values, axis=1) / np.maximum(count, 1)[:, None], np.nan)
 
 
-def thin(count: int, limit: int) -> Rows:
+def choose_evenly(count: int, limit: int) -> Rows:
     """Choose at most `limit` of `count` places, evenly, with the first and the last."""
     return np.unique(np.round(np.linspace(0, count - 1, min(count, limit))).astype(np.int64))

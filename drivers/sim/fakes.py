@@ -59,7 +59,7 @@ def _load() -> None:
             importlib.import_module(module.name)
 
 
-def fake_of(key: str) -> Fake:
+def get_fake(key: str) -> Fake:
     """The fake of a section, of one of its protocols, or of another package's kind; ValueError when there is none,
     ConfigError when it cannot be loaded."""
     _load()

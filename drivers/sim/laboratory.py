@@ -24,7 +24,7 @@ from thermostand.drivers.sim.fakes import (
     Bench,
     Fake,
     fake,
-    fake_of,
+    get_fake,
 )
 from thermostand.drivers.sim.gige.camera import FakeCamera
 from thermostand.drivers.sim.gige.genicam_file import read_genicam
@@ -313,7 +313,7 @@ class Laboratory:
     def _build(self) -> None:
         """Build the devices in the order of their ranks: what acts on the plant, in the order in which it acts; what
         shares the bus; what has a line of its own."""
-        ranked = {name: fake_of(each.fake) for name, each in self.spec.devices.items()}
+        ranked = {name: get_fake(each.fake) for name, each in self.spec.devices.items()}
         self._build_those(ranked, CONTROL, OUTPUT)
         self.plant.on_step.append(self._conduct)  # after the regulator's and the relays'
         self._build_those(ranked, MEASURE, CONTACTS)

@@ -162,7 +162,7 @@ def name_fields(channels: Iterable[Channel]) -> tuple[str, ...]:
     return tuple(fields)
 
 
-def name_apart(channel: str, unit: str, first: str) -> str:
+def disambiguate_channel(channel: str, unit: str, first: str) -> str:
     """Return what a channel is called in a session in which it was recorded in the unit `first` before: its name, or
     with another unit `lab.pressure (mbar)`."""
     return channel if unit == first else f"{channel} ({unit})"

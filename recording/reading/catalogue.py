@@ -150,13 +150,13 @@ def load_catalogue(
             if tell is not None:
                 tell(number, path.name)
             with suppress(SessionError):  # it was removed meanwhile
-                known[path] = look_at(path)
+                known[path] = inspect_session(path)
                 index.put(path, digests[path], known[path])
         index.keep(found)
     return sorted(known.values(), key=lambda entry: (entry.begin_ns or 0, str(entry.path)))
 
 
-def look_at(path: Path) -> ListedSession:
+def inspect_session(path: Path) -> ListedSession:
     """The session in `path`, whatever an index says; SessionError when there is none."""
     from thermostand.recording.reading.scan import scan  # takes half a second to import
 

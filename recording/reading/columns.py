@@ -20,7 +20,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.extras import import_extra
 from thermostand.foundation.items import Batch
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchSchema, name_apart
+from thermostand.recording.format.batches import BAD, KNOWN_QUALITIES, BatchSchema, disambiguate_channel
 from thermostand.recording.format.records import RecordedMessage
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class ReadingColumns:
 
     def _name_channel(self, channel: str, unit: str) -> str:
         """Return what a channel is called that is read in this unit."""
-        name = name_apart(channel, unit, self.units.setdefault(channel, unit))
+        name = disambiguate_channel(channel, unit, self.units.setdefault(channel, unit))
         self.units[name] = unit
         return name
 

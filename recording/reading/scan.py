@@ -37,7 +37,7 @@ from thermostand.foundation.errors import SessionError
 from thermostand.foundation.events import FRAMES_DROPPED, RUN_BEGINS, RUN_END, TELL_PLAN
 from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.recording.format import messages
-from thermostand.recording.format.batches import READINGS, name_apart
+from thermostand.recording.format.batches import READINGS, disambiguate_channel
 from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
 from thermostand.recording.format.damage import DAMAGE
 from thermostand.recording.format.holes import Hole, format_segments, parse_holes
@@ -161,7 +161,7 @@ class Recorded:
             for reading in message.form.decode(message.data, message.time_ns).readings:
                 channel = self.channels.setdefault(reading.channel, ChannelReadings(reading.unit))
                 if channel.unit != reading.unit:
-                    name = name_apart(reading.channel, reading.unit, channel.unit)
+                    name = disambiguate_channel(reading.channel, reading.unit, channel.unit)
                     channel = self.channels.setdefault(name, ChannelReadings(reading.unit))
                 channel.times_ns.append(reading.time_ns)
                 channel.values.append(reading.value)

@@ -81,11 +81,11 @@ def list_telemetry_topics(devices: Mapping[str, RecordedDevice]) -> tuple[Topic,
     """One for the readings of each of these devices, by name, and those every session has. That of an imager's pictures
     begins with the first of them."""
     own = (make_readings_topic(make_batch_schema(name, device)) for name, device in devices.items())
-    pose = [messages.TABLE_POSE] * (len(stages_of(devices)) == len(_TABLE_UNITS))
+    pose = [messages.TABLE_POSE] * (len(list_stages(devices)) == len(_TABLE_UNITS))
     return (*own, *map(_known_topic, (*pose, messages.STEP, messages.EVENT, messages.LOG)))
 
 
-def stages_of(devices: Mapping[str, RecordedDevice]) -> dict[str, str]:
+def list_stages(devices: Mapping[str, RecordedDevice]) -> dict[str, str]:
     """Device -> channel of the table's position along, and around: the first that declares one in mm, and in deg."""
     by_unit: dict[str, tuple[str, str]] = {}
     for name, device in devices.items():

@@ -24,7 +24,7 @@ from thermostand.recording.writing.pending_items import PendingItems
 from thermostand.recording.writing.recorder_settings import RecordingSettings
 from thermostand.recording.writing.segment import MessageRecord
 from thermostand.recording.writing.series import DiskSeries
-from thermostand.recording.writing.session_spec import stages_of
+from thermostand.recording.writing.session_spec import list_stages
 
 PORTION_RECORDS = 5000  # committed at once; a disk that refuses is not offered hours of telemetry each second
 
@@ -125,7 +125,7 @@ class TelemetryEncoder:
 
     def __init__(self, devices: Mapping[str, RecordedDevice]) -> None:
         self._forms = {name: make_batch_schema(name, device) for name, device in devices.items()}
-        self._stages = stages_of(devices)
+        self._stages = list_stages(devices)
         self._table: dict[str, float] = {}  # unit -> last position of the stage in that unit
 
     def check(self, item: Item) -> None:

@@ -23,7 +23,7 @@ def alert() -> None:
 
 
 @app.command("test")
-def try_them(config: ConfigOption = "simulated") -> None:
+def send_test_message(config: ConfigOption = "simulated") -> None:
     """Send a test message to each receiver, and give the sign of life once.
 
     Example: stand alert test --config my-stand.yaml

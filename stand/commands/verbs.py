@@ -18,7 +18,7 @@ from thermostand.foundation.output import show
 from thermostand.foundation.usage import escape_line
 from thermostand.stand.commands.endpoint import OPTIONS, DirectoryArgument, find_server
 from thermostand.stand.service.stand_service import StandService
-from thermostand.stand.serving.api_models import Done
+from thermostand.stand.serving.api_models import CommandAnswer
 from thermostand.stand.serving.client import API, Answer, Server
 from thermostand.stand.serving.commands import STOP, Command, Served, Typed, collect_commands
 
@@ -76,7 +76,7 @@ def _make_verb(command: Command) -> Callable[..., None]:
 
 def _format_answer(server: Server, command: Command, answer: Answer) -> str:
     """A sentence of what came of it; of what is queued its number, for programs."""
-    if command.answer is not Done:
+    if command.answer is not CommandAnswer:
         return str(answer.get("id", ""))
     moving = ", ".join(map(escape_line, cast("list[str]", answer.get("moving", []))))
     text = str(answer.get("text") or command.name) + (f"; still moving: {moving}" if moving else "")

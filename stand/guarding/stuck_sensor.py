@@ -21,7 +21,7 @@ _STUCK_S, _MOVED_K = 60.0, 1.0  # a probe in steps of 0.1 K follows within secon
 
 
 @dataclass(frozen=True, slots=True)
-class Still:
+class StillReading:
     """A value that has not changed since `since_ns`; the smallest step that any thermometer of the module has made, and
     what each showed last."""
 
@@ -42,9 +42,9 @@ def forbid_stuck_sensor(channel: str, module: tuple[str, ...], regulator: str) -
         outputs = (get_value(readings, f"{regulator}.{side}") for side in ("mv_heat", "mv_cool"))
         return get_value(readings, f"{regulator}.running") == 1 and any(output > 0 for output in outputs)
 
-    def step(last: Still | None, readings: Readings, now_ns: int) -> tuple[Still | None, Fault | None]:
+    def step(last: StillReading | None, readings: Readings, now_ns: int) -> tuple[StillReading | None, Fault | None]:
         value = get_value(readings, channel)
-        state = _update_step(last or Still(), {name: get_value(readings, name) for name in module})
+        state = _update_step(last or StillReading(), {name: get_value(readings, name) for name in module})
         if value != state.value or not works(readings):
             return replace(state, value=value, since_ns=now_ns), None
         if state.step_K > FINE_STEP_K or now_ns - state.since_ns < to_ns(_FROZEN_S):
@@ -55,7 +55,7 @@ def forbid_stuck_sensor(channel: str, module: tuple[str, ...], regulator: str) -
     return make_stateful_rule(step)
 
 
-def _update_step(state: Still, shown: dict[str, float]) -> Still:
+def _update_step(state: StillReading, shown: dict[str, float]) -> StillReading:
     if state.step_K <= FINE_STEP_K:  # fine enough is known
         return state
     steps_K = [abs(value - state.shown.get(name, math.nan)) for name, value in shown.items()]

@@ -36,11 +36,11 @@ from thermostand.stand.config.stand_config import StandConfig, find_packaged, lo
 from thermostand.stand.running.executing.actions import find_cold_start_steps
 from thermostand.stand.running.executing.camera_gap import CameraHistory, load_camera_history
 from thermostand.stand.running.memory.entries import (
-    Again,
     Begun,
     Ended,
     Entry,
     JournalEntry,
+    Restarted,
     StepChanged,
     Taken,
     Tripped,
@@ -228,7 +228,7 @@ class Interruption:
     def kept(self) -> RunState:
         """What counts of it: without the steps of a warm-up that is restarted."""
         again = [planned.step_id for planned in find_cold_start_steps(self.state)]
-        return apply_entry(self.state, Again(self.last_ns, again)) if again else self.state
+        return apply_entry(self.state, Restarted(self.last_ns, again)) if again else self.state
 
     def release(self) -> None:
         """Give the session free for another daemon; may be called twice."""
@@ -298,7 +298,7 @@ def _load(
 
 def _changed_units(session: Session, config: StandConfig) -> Iterator[Difference]:
     """Channels that a device of this stand measures in another unit than it did in the session; what follows is kept
-    apart from what there is (`name_apart`)."""
+    apart from what there is (`disambiguate_channel`)."""
     before = recorded_devices(session.telemetry_segments)
     for name, device in declared_devices(config).items():
         units = {each.name: each.unit for each in before[name].channels} if name in before else {}
@@ -328,14 +328,16 @@ def merge_recorded(entries: Sequence[Entry], items: Iterable[Item], frames: Iter
     captures that were restarted and changes of the plan, by `frames` (instant and step of each) what was captured."""
     done: list[Entry] = []
     others: list[Entry] = [Taken(time_ns, step_id) for time_ns, step_id in frames]
-    known = {(entry.time_ns, step_id) for entry in entries if isinstance(entry, Again) for step_id in entry.step_ids}
+    known = {
+        (entry.time_ns, step_id) for entry in entries if isinstance(entry, Restarted) for step_id in entry.step_ids
+    }
     for item in items:
         if isinstance(item, StepMark) and item.state is StepState.DONE:
             done.append(StepChanged(item.time_ns, item.step_id, "done"))
         if isinstance(item, Event):
             step_id = find_restarted_step(item)
             if step_id and (item.time_ns, step_id) not in known:
-                others.append(Again(item.time_ns, [step_id], count_frames_lost(item)))
+                others.append(Restarted(item.time_ns, [step_id], count_frames_lost(item)))
             change = parse_change(item.time_ns, item.data) if item.kind == PLAN_CHANGED else None
             if change is not None and change not in entries:
                 others.append(change)

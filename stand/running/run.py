@@ -197,7 +197,7 @@ class Run:
         """The whole plan, or what is not done of it; the actuators are safe before anything else is taken down. The end
         of `recording` ends the run."""
         open_stand, assembly, stop, log = self._open_stand, self._assembly, self.stop, self.log
-        open_stand.guest, open_stand.recorder = self, self.recorder
+        open_stand.active_run, open_stand.recorder = self, self.recorder
         open_stand.prepare()
         preload()
         target = parse_document(self.job.order.target_text, Target, "target.yaml")
@@ -232,7 +232,7 @@ class Run:
                 finally:  # also when a subscriber fails
                     await open_stand.make_safe_and_stop(watchers)
                     settling.close()
-                    stop.ended()
+                    stop.end()
                     await log.end(ended, stop.shutdown_deadline)
 
     async def _begin(self, settling: SettlingWatch, leaving: AsyncExitStack) -> Executor:

@@ -30,9 +30,9 @@ from thermostand.stand.serving.api_models import (
     PlanCheck,
     PlanStep,
     PromptState,
+    Requester,
     StepFault,
     StepStanding,
-    Who,
     WrittenStep,
 )
 
@@ -44,7 +44,7 @@ from thermostand.stand.serving.api_models import (
 class OperatorNote:
     """A sentence, tags, or both; ConfigError for neither, and for what is no tag."""
 
-    who: Who
+    who: Requester
     text: str
     tags: Sequence[str]
 
@@ -168,7 +168,7 @@ class RunControl:
             "pausing": self.pauses_next,
         }
 
-    def go_on(self) -> None:
+    def end_pause(self) -> None:
         """End the pause, and any that was to come."""
         self.pauses_next, self._prompt = False, None
         self.assembly.stand.gate.clear(OPERATOR)

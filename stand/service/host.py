@@ -34,14 +34,14 @@ class Host:
         self._began_ns = self._clock.now_ns()
 
     @property
-    def guest(self) -> Run | None:
+    def active_run(self) -> Run | None:
         """The run that has the stand."""
-        return cast("Run | None", self.open_stand.guest)
+        return cast("Run | None", self.open_stand.active_run)
 
     @property
     def has_run(self) -> bool:
         """Whether a run has the stand."""
-        return self.guest is not None
+        return self.active_run is not None
 
     @property
     def is_leaving(self) -> bool:
@@ -62,9 +62,9 @@ class Host:
 
     def queue(self) -> tuple[QueuedRun, ...]:
         """Return what has been run, is and will be."""
-        if (guest := self.guest) is None:
+        if (active_run := self.active_run) is None:
             return ()
-        order, began_ns = guest.job.order, self._began_ns
+        order, began_ns = active_run.job.order, self._began_ns
         return (
             QueuedRun(
                 id=1,
@@ -72,7 +72,7 @@ class Host:
                 state="running",
                 added_ns=began_ns,
                 began_ns=began_ns,
-                session=guest.recorder.directory.name,
+                session=active_run.recorder.directory.name,
             ),
         )
 
@@ -119,10 +119,10 @@ class Host:
         """The stand is made safe at once; a run that has it ends."""
         for hand in self.manual_tasks:
             hand.cancel()
-        if self.guest is None:
+        if self.active_run is None:
             self._assembly.stand.safety.demand()
         else:
-            self.guest.stop()
+            self.active_run.stop()
 
     def wake(self) -> None:
         """Look at the queue: it may have something to run."""

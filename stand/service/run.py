@@ -325,7 +325,7 @@ async def run_on_stand(open_stand: OpenStand, job: Job, stop: Stop) -> Path:
             _check_outcome(directory, recorder, open_stand.assembly)
         return directory
     finally:
-        open_stand.left()
+        open_stand.release_run()
         hub.unsubscribe(early)
         if job.before is not None:
             job.before.release()

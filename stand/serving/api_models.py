@@ -46,7 +46,7 @@ class Value(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
-class Who(Value):
+class Requester(Value):
     """Who asks. name: the user of the socket, else the name of the token; "" when it is not known. read_only: may look
     and press STOP, but order nothing."""
 
@@ -232,7 +232,7 @@ class StandState(Value):
     pausing: bool = False
 
 
-class Done(Value):
+class CommandAnswer(Value):
     """The answer to a command. reasons: what holds the run now; moving: what is still under way, as in
     `linear to 250 mm`; text: what came of it, in a sentence; seq: of the command's event in the stream."""
 

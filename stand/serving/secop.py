@@ -32,10 +32,10 @@ from thermostand.foundation.errors import (
 )
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
 from thermostand.stand.serving.api.listeners import ProtocolListener
-from thermostand.stand.serving.api_models import Conflict, QueuedRun, ReadingState, StandState, Who
+from thermostand.stand.serving.api_models import Conflict, QueuedRun, ReadingState, Requester, StandState
 from thermostand.stand.serving.secop_modules import Module, Order, Parameter, Refusal, check_value, make_modules
 
-WHO = Who(name="", how="secop")
+WHO = Requester(name="", how="secop")
 IDENTIFY, IDENTIFICATION = "*IDN?", "ISSE&SINE2020,SECoP,V2019-09-16,v1.0"  # clients compare the first two fields
 WORDS = (IDENTIFY, "describe", "activate", "deactivate", "read", "change", "do", "ping", "help")
 # Round numbers; nothing was measured.

@@ -34,7 +34,7 @@ from tests.compensation.drawn_sessions import (
 )
 from thermostand.compensation.design.next_visit import DesignGoal, decide
 from thermostand.compensation.drift.model_selection import fit
-from thermostand.experiments.adaptive import Enough, Visit, apply_decision, begin_cycle, plan_fixed_visits
+from thermostand.experiments.adaptive import CycleComplete, Visit, apply_decision, begin_cycle, plan_fixed_visits
 from thermostand.experiments.parameters import CaptureParameters, Known
 from thermostand.experiments.steps import Capture, Decide, SetTemperature, Soak, Step, estimate_duration_s
 from thermostand.foundation.errors import SessionError
@@ -158,7 +158,7 @@ def record_adaptive_session(
                     as_good_s = gone_s if compute_left_mpx(made, asked) <= fixed_mpx else np.inf
                 wanted = DesignGoal(_RANGE_DEGC, residual_px, HELD_OUT_DEGC, step.soaks_s, step.ramp_K_per_min)
                 found = decide(made.observed, wanted)
-                answer = Enough() if found.kind == "enough" else Visit(found.chamber_degC, found.soak_s)
+                answer = CycleComplete() if found.kind == "enough" else Visit(found.chamber_degC, found.soak_s)
                 steps = list(apply_decision(step, answer))
                 continue
             case _:

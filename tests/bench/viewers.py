@@ -28,7 +28,7 @@ from thermostand.stand.running.opening.stop import Interrupted, Stop
 from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 from thermostand.stand.serving.client import Server, find_session_server
 from thermostand.stand.serving.instances import list_daemons
 
@@ -74,7 +74,7 @@ class _Service(StandService):
 
     stop_run: Stop
 
-    def stop(self, who: Who) -> str:
+    def stop(self, who: Requester) -> str:
         self.stop_run()
         return ""
 
@@ -84,7 +84,7 @@ _Times = tuple[list[float], list[float]]  # of stops, and of a process that only
 
 async def _measure_stops(config: StandConfig, session: Path) -> tuple[_Times, _Times]:
     async with abort.open_polled_stand(config) as (assembly, control):
-        service = _Service(cast("Any", SimpleNamespace(assembly=assembly, guest=None, latched=None)))
+        service = _Service(cast("Any", SimpleNamespace(assembly=assembly, active_run=None, latched=None)))
 
         async def by_command(stand: Stand, _: Assembly) -> float:
             begun_s = math.nan

@@ -45,11 +45,11 @@ from thermostand.compensation.reporting.report_numbers import (
     serialise_numbers,
 )
 from thermostand.compensation.reporting.tracks import (
+    choose_evenly,
     compute_displacement_px,
     find_cycle,
     find_warm_ups,
     list_visits,
-    thin,
 )
 from thermostand.experiments.steps import Role
 from thermostand.foundation.errors import SessionError
@@ -547,8 +547,8 @@ def test_visits_know_from_which_side_they_were_reached():
 
 
 def test_thinning_keeps_the_ends():
-    assert thin(5, 10).tolist() == [0, 1, 2, 3, 4]
-    assert thin(3600, 4).tolist() == [0, 1200, 2399, 3599]
+    assert choose_evenly(5, 10).tolist() == [0, 1, 2, 3, 4]
+    assert choose_evenly(3600, 4).tolist() == [0, 1200, 2399, 3599]
 
 
 def test_figures_bear_missing_frames_and_temperatures():

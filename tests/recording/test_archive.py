@@ -12,7 +12,7 @@ from tests.recording.runs import record_run
 from thermostand.foundation.errors import SessionError
 from thermostand.recording.exporting import archive as module
 from thermostand.recording.exporting.archive import MANIFEST, DeletionRule, archive, check_copy, delete, explain_unfit
-from thermostand.recording.reading.catalogue import look_at
+from thermostand.recording.reading.catalogue import inspect_session
 from thermostand.recording.reading.notes import add_note, add_tags, read_notes
 from thermostand.recording.reading.scan import verify
 
@@ -44,31 +44,31 @@ def contents(directory: Path) -> dict[str, bytes]:
 
 def test_a_copy_is_the_session_and_is_known(session: Path, nas: Path):
     add_note(session, "windy", "eva", 1)
-    assert look_at(session).archived == ""
+    assert inspect_session(session).archived == ""
     done: list[int] = []
-    copy = archive(look_at(session), nas, "eva", 5, done.append)
+    copy = archive(inspect_session(session), nas, "eva", 5, done.append)
     assert copy == nas / "cycle"
     assert contents(copy) == contents(session)
-    assert sum(done) >= 2 * look_at(session).size_bytes
+    assert sum(done) >= 2 * inspect_session(session).size_bytes
     assert verify(copy).is_sound
-    assert look_at(session).archived == str(copy)
-    check_copy(copy, look_at(session).contents)
+    assert inspect_session(session).archived == str(copy)
+    check_copy(copy, inspect_session(session).contents)
     assert (read_notes(session).archived[0].time_ns, list(nas.iterdir())) == (5, [copy])
 
 
 def test_a_session_that_grew_since_is_not_archived_any_more_and_its_copy_is_not_overwritten(session: Path, nas: Path):
-    archive(look_at(session), nas, "eva", 5)
+    archive(inspect_session(session), nas, "eva", 5)
     with (session / "journal.jsonl").open("ab") as file:
         file.write(b"00000000 {}\n")
-    assert look_at(session).archived == ""
+    assert inspect_session(session).archived == ""
     with pytest.raises(SessionError, match="is there already"):
-        archive(look_at(session), nas, "eva", 6)
+        archive(inspect_session(session), nas, "eva", 6)
 
 
 def test_notes_given_later_leave_it_archived(session: Path, nas: Path):
-    archive(look_at(session), nas, "eva", 5)
+    archive(inspect_session(session), nas, "eva", 5)
     add_tags(session, ["paper"], "eva", 6)
-    assert look_at(session).archived
+    assert inspect_session(session).archived
 
 
 def test_an_interrupted_copy_goes_on_behind_its_last_file(session: Path, nas: Path, monkeypatch):
@@ -83,13 +83,13 @@ def test_an_interrupted_copy_goes_on_behind_its_last_file(session: Path, nas: Pa
 
     monkeypatch.setattr(module, "_copy_file", cut)
     with pytest.raises(KeyboardInterrupt):
-        archive(look_at(session), nas, "eva", 5)
+        archive(inspect_session(session), nas, "eva", 5)
     monkeypatch.setattr(module, "_copy_file", whole)
     assert not (nas / "cycle").exists()
     first = {path: path.stat().st_ino for path in (nas / "cycle.part").rglob("*.mcap")}
     assert first
     (nas / "cycle.part" / "frames" / ".0003.mcap.copying").write_bytes(b"part")
-    copy = archive(look_at(session), nas, "eva", 6)
+    copy = archive(inspect_session(session), nas, "eva", 6)
     assert contents(copy) == contents(session)
     assert {path.stat().st_ino for path in copy.rglob("*.mcap")} >= set(first.values())
 
@@ -101,33 +101,33 @@ def test_what_reads_back_differently_is_no_copy_and_the_next_try_mends_it(sessio
     data[100] ^= 1
     (part / "0001.mcap").write_bytes(data)
     with pytest.raises(SessionError, match="reads back differently"):
-        archive(look_at(session), nas, "eva", 5)
-    assert look_at(session).archived == ""
-    assert contents(archive(look_at(session), nas, "eva", 6)) == contents(session)
+        archive(inspect_session(session), nas, "eva", 5)
+    assert inspect_session(session).archived == ""
+    assert contents(archive(inspect_session(session), nas, "eva", 6)) == contents(session)
 
 
 def test_what_is_recorded_unfinished_or_may_be_resumed_is_not_copied(session: Path, nas: Path):
-    entry = look_at(session)
+    entry = inspect_session(session)
     for run in ("running", "interrupted"):
         with pytest.raises(SessionError, match=f"its run is {run} and may be resumed"):
             archive(replace(entry, run=run), nas, "eva", 5)
     shutil.copy(session / "frames" / "0000.mcap", session / "frames" / "0009.mcap.part")
-    assert "was never finished" in explain_unfit(look_at(session))
+    assert "was never finished" in explain_unfit(inspect_session(session))
     assert not nas.exists()
 
 
 def test_a_full_disk_is_reported_before_anything_is_copied(session: Path, nas: Path, monkeypatch):
     monkeypatch.setattr(module.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10, 9, 1))
     with pytest.raises(SessionError, match=r"0.0 GB free, .* needs 0.1 GB"):
-        archive(look_at(session), nas, "eva", 5)
+        archive(inspect_session(session), nas, "eva", 5)
 
 
 def test_the_rule_says_what_may_be_deleted(session: Path, nas: Path):
-    end_ns = look_at(session).end_utc_ns
+    end_ns = inspect_session(session).end_utc_ns
     rule = DeletionRule(30)
-    assert not rule.applies(look_at(session), end_ns + 40 * DAY_NS)
-    archive(look_at(session), nas, "eva", 5)
-    entry = look_at(session)
+    assert not rule.applies(inspect_session(session), end_ns + 40 * DAY_NS)
+    archive(inspect_session(session), nas, "eva", 5)
+    entry = inspect_session(session)
     assert [rule.applies(entry, end_ns + days * DAY_NS) for days in (0, 29, 30, 31)] == [False, False, True, True]
     assert not rule.applies(replace(entry, files="damaged"), end_ns + 40 * DAY_NS)
     assert not rule.applies(replace(entry, tags=("keep",)), end_ns + 40 * DAY_NS)
@@ -135,9 +135,9 @@ def test_the_rule_says_what_may_be_deleted(session: Path, nas: Path):
 
 
 def test_what_has_a_copy_is_deleted(session: Path, nas: Path):
-    copy = archive(look_at(session), nas, "eva", 5)
+    copy = archive(inspect_session(session), nas, "eva", 5)
     before = contents(session)
-    delete(look_at(session))
+    delete(inspect_session(session))
     assert list(session.parent.iterdir()) == []
     assert contents(copy) == before
 
@@ -152,8 +152,8 @@ def test_what_has_a_copy_is_deleted(session: Path, nas: Path):
     ],
 )
 def test_without_a_whole_copy_nothing_is_deleted(session: Path, nas: Path, change, reason: str):
-    copy = archive(look_at(session), nas, "eva", 5)
-    entry = look_at(session)
+    copy = archive(inspect_session(session), nas, "eva", 5)
+    entry = inspect_session(session)
     change(session, copy)
     before = contents(session)
     with pytest.raises(SessionError, match=reason):
@@ -162,19 +162,19 @@ def test_without_a_whole_copy_nothing_is_deleted(session: Path, nas: Path, chang
 
 
 def test_a_flipped_bit_of_the_copy_is_found_before_anything_is_deleted(session: Path, nas: Path):
-    copy = archive(look_at(session), nas, "eva", 5)
+    copy = archive(inspect_session(session), nas, "eva", 5)
     data = bytearray((copy / "frames/0001.mcap").read_bytes())
     data[-100] ^= 1
     (copy / "frames/0001.mcap").write_bytes(data)
     with pytest.raises(SessionError, match="reads back differently"):
-        delete(look_at(session))
+        delete(inspect_session(session))
     assert session.is_dir()
     assert (copy / "frames/0001.mcap").exists()
 
 
 def test_a_session_that_a_daemon_has_open_is_not_deleted(session: Path, nas: Path):
-    archive(look_at(session), nas, "eva", 5)
-    entry = look_at(session)
+    archive(inspect_session(session), nas, "eva", 5)
+    entry = inspect_session(session)
     with (session / "journal.jsonl").open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(SessionError, match="it is kept"):

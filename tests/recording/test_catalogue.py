@@ -12,7 +12,7 @@ import pytest
 from tests.recording.full_session import START_NS
 from tests.recording.runs import record_run
 from thermostand.recording.reading import catalogue as module
-from thermostand.recording.reading.catalogue import INDEX_NAME, SessionCache, load_catalogue, look_at
+from thermostand.recording.reading.catalogue import INDEX_NAME, SessionCache, inspect_session, load_catalogue
 from thermostand.recording.reading.notes import add_note, add_tags
 
 
@@ -36,9 +36,9 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def look(path: Path):
         seen.append(path.name)
-        return look_at(path)
+        return inspect_session(path)
 
-    monkeypatch.setattr(module, "look_at", look)
+    monkeypatch.setattr(module, "inspect_session", look)
     return seen
 
 
@@ -47,7 +47,7 @@ def listed(folder: Path, looks: list[str]) -> list[str]:
     looks.clear()
     entries = load_catalogue(folder)
     looked = sorted(looks)
-    assert entries == sorted((look_at(entry.path) for entry in entries), key=lambda entry: str(entry.path))
+    assert entries == sorted((inspect_session(entry.path) for entry in entries), key=lambda entry: str(entry.path))
     return looked
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.stand.browser import PHONE, a_page, browser
 from tests.stand.page_service import free_port, serve_cycle
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 
 WIDE = (1280, 900)
 COLOURS = 256
@@ -44,7 +44,7 @@ async def take(folder: Path) -> None:
                     await page.get_by_role("button", name="Look at it and reset").click()
                     await page.wait_for_timeout(2000)
                     await page.screenshot(path=folder / "page-tripped.png")
-                desk.reset(Who(name="anna", how="loopback"))
+                desk.reset(Requester(name="anna", how="loopback"))
                 lost = await pages.enter_async_context(a_page(chromium, port, "plan", PHONE, "dark"))
                 await lost.locator(".steps li", has_text="soak").first.wait_for()
             await lost.get_by_text("No connection to the stand").wait_for()

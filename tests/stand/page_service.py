@@ -36,10 +36,10 @@ from thermostand.stand.serving.api_models import (
     PlanStep,
     PromptState,
     QueuedRun,
+    Requester,
     RunStatus,
     StandState,
     StepStanding,
-    Who,
     WrittenStep,
 )
 from thermostand.stand.serving.page_data import PageData
@@ -196,26 +196,26 @@ class CycleService(FakeService):
             DeviceState(name="camera", kind="camera", verbs=(DeviceVerb(verb="frame", text="Take one frame"),)),
         )
 
-    def pause(self, who: Who, given: PauseRequest) -> str:
+    def pause(self, who: Requester, given: PauseRequest) -> str:
         self.pausing = given.when == "step"
         return "" if self.pausing else super().pause(who, given)
 
-    def continue_(self, who: Who) -> str:
+    def continue_(self, who: Requester) -> str:
         self.prompt, self.pausing = None, False
         return super().continue_(who)
 
-    def reset(self, who: Who) -> str:
+    def reset(self, who: Requester) -> str:
         done = super().reset(who)
         self.tripped = None
         return done
 
-    async def skip(self, who: Who, given: SkipRequest) -> str:
+    async def skip(self, who: Requester, given: SkipRequest) -> str:
         return ""
 
-    async def extend(self, who: Who, given: ExtendRequest) -> str:
+    async def extend(self, who: Requester, given: ExtendRequest) -> str:
         return ""
 
-    def stop(self, who: Who) -> str:
+    def stop(self, who: Requester) -> str:
         self.stops += 1
         return "the stand is made safe"
 
@@ -298,7 +298,7 @@ class CycleService(FakeService):
             if step.began_ns is not None:
                 history(StepMark(step.began_ns, step.step_id, step.index, step.kind, StepState.STARTED, {}))
 
-    async def go_on(self) -> None:
+    async def end_pause(self) -> None:
         """Poll once a second."""
         while True:
             for batch in self.batches(self.now_s(), 1.0):
@@ -349,7 +349,7 @@ async def serve_cycle(
     desk.live_through(viewing)
     desk.viewing = viewing
     folder.mkdir(exist_ok=True)
-    polling = asyncio.create_task(desk.go_on())
+    polling = asyncio.create_task(desk.end_pause())
     try:
         async with serve_fake(desk, folder / "now", Interface(folder, port=port, extra_routes=(PageRoutes(viewing),))):
             if with_frames:

@@ -17,8 +17,8 @@ from thermostand.stand.serving.api_models import (
     Conflict,
     DeviceState,
     DeviceVerb,
+    Requester,
     StandState,
-    Who,
 )
 from thermostand.stand.serving.secop import make_secop_listener
 
@@ -90,7 +90,7 @@ class SecopService(FakeService):
             _device("camera", "camera", ("camera.temperature",), _verb("on"), _verb("off"), _verb("frame", FOR)),
         )
 
-    async def device(self, who: Who, given: DeviceRequest) -> str:
+    async def device(self, who: Requester, given: DeviceRequest) -> str:
         name, verb, arguments = given.device, given.verb, given.arguments
         if self.phase != "idle":
             raise Conflict("a run has the stand; `stand stop` ends it")

@@ -24,7 +24,7 @@ from thermostand.stand.running.executing.settling_watch import SettlingWatch
 from thermostand.stand.running.memory.entries import Gap
 from thermostand.stand.running.memory.fold import fold
 from thermostand.stand.running.memory.journal import JOURNAL_NAME, Journal, Logbook
-from thermostand.stand.running.opening.holds import keep_shut_in_holds
+from thermostand.stand.running.opening.holds import keep_flap_closed_in_holds
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.resume import merge_recorded
 from thermostand.stand.safety.gate import CAMERA_LOST, INTERLOCK, OPERATOR, STOPPING, Gate
@@ -235,7 +235,7 @@ class Life:
             decider=self._decider,
             meet=self._meet,
         )
-        self._flap = asyncio.create_task(keep_shut_in_holds(stand, self.hub, self.clock))
+        self._flap = asyncio.create_task(keep_flap_closed_in_holds(stand, self.hub, self.clock))
         self.run = asyncio.create_task(self._run(self.executor))
         if self._follows:
             self._chamber = asyncio.create_task(self._follow())
@@ -254,7 +254,7 @@ class Life:
                 self.stop.begin_takedown()
                 self.stand.safety.demand()
                 await self.stand.safety.wait_until_confirmed(600.0)
-                self.stop.ended()
+                self.stop.end()
                 await self.stop.wait_until_aborted()
 
     async def _flushed(self):

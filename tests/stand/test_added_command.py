@@ -19,7 +19,7 @@ from thermostand.foundation.items import Event, Item
 from thermostand.stand.commands.verbs import make_app
 from thermostand.stand.serving.api.bridge import Bridge
 from thermostand.stand.serving.api.listeners import Interface
-from thermostand.stand.serving.api_models import Conflict, Who
+from thermostand.stand.serving.api_models import Conflict, Requester
 from thermostand.stand.serving.client import find_session_server
 from thermostand.stand.serving.commands import collect_commands, command
 from thermostand.stand.serving.page_data import PageData
@@ -37,7 +37,7 @@ class Flushing(SecopService):
     """A service with one more command."""
 
     @command("/run/flush")
-    async def flush(self, who: Who, given: FlushRequest) -> str:
+    async def flush(self, who: Requester, given: FlushRequest) -> str:
         """Blow dry air.
 
         Example: stand flush 5

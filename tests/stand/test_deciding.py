@@ -13,7 +13,7 @@ import pytest
 from tests.journals import read_lines
 from tests.stand.decisions_process import ANSWERS, ASKED, decide_next_visit
 from tests.stand.small_stand import Life, lives
-from thermostand.experiments.adaptive import Enough, Undecided, Visit, apply_decision, plan_fixed_visits
+from thermostand.experiments.adaptive import CycleComplete, DecisionPending, Visit, apply_decision, plan_fixed_visits
 from thermostand.experiments.parameters import Known
 from thermostand.experiments.steps import (
     Capture,
@@ -149,7 +149,7 @@ async def test_a_late_decision_is_not_waited_for(tmp_path: Path):
     (tmp_path / ANSWERS).write_text('["hang"]')
     decider = Decider(tmp_path, WallClock(), decide_next_visit)
     found = await decider.decide(replace(DECIDE, wait_s=0.5))
-    assert isinstance(found.answer, Undecided)
+    assert isinstance(found.answer, DecisionPending)
     assert "within 0.5 s" in found.reason
 
 
@@ -157,7 +157,7 @@ def total_s(steps: tuple[Step, ...]) -> float:
     return estimate_duration_s(step for step in steps if not isinstance(step, Decide))
 
 
-@pytest.mark.parametrize("answer", [Visit(47.0, 120.0), Visit(11.0, 60.0), Undecided()])
+@pytest.mark.parametrize("answer", [Visit(47.0, 120.0), Visit(11.0, 60.0), DecisionPending()])
 def test_no_course_of_decisions_takes_much_longer_than_the_fixed_cycle(answer: Any):
     steps: tuple[Step, ...] = (DECIDE, *plan_fixed_visits(DECIDE))
     gone: list[Step] = []
@@ -176,6 +176,6 @@ def test_no_course_of_decisions_takes_much_longer_than_the_fixed_cycle(answer: A
 
 
 def test_enough_ends_the_cycle_with_what_was_not_validated():
-    steps = apply_decision(DECIDE, Enough())
+    steps = apply_decision(DECIDE, CycleComplete())
     assert [step for step in steps if isinstance(step, SetTemperature | Soak)] == [SetTemperature(40.0), Soak(120.0)]
     assert not math.isnan(DECIDE.left_s)

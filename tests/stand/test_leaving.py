@@ -128,7 +128,7 @@ def test_what_a_daemon_leaves_on_a_hung_disk_takes_one_budget(tmp_path: Path):
             hub.publish(Event(clock.now_ns(), "info", "note", "the last"))
             compressor.note(CompressorState(running=False, since_ns=1))
             stop.reason = STOPPED
-            stop.ended()
+            stop.end()
             with pytest.raises(SessionError, match="not in the journal"):
                 await log.end(Ended(0, "stopped", "stopped"), stop.shutdown_deadline)
             recording.cancel()

@@ -17,12 +17,12 @@ from thermostand.foundation.items import Event, StepMark, StepState
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
 from thermostand.recording.format.capture_restarts import make_restart_event
 from thermostand.stand.running.memory.entries import (
-    Again,
     Begun,
     Ended,
     Entry,
     Held,
     Reset,
+    Restarted,
     Skipped,
     StepChanged,
     Taken,
@@ -59,7 +59,7 @@ def test_a_step_is_done_when_its_end_is_recorded_and_not_when_it_was_begun_or_fa
 
 
 def test_a_capture_that_was_begun_again_and_a_change_of_the_plan_count_once_be_they_in_the_journal_or_not():
-    again, skipped = Again(5, [CAPTURE], 2), Skipped(7, WARM)
+    again, skipped = Restarted(5, [CAPTURE], 2), Skipped(7, WARM)
     items = [
         make_restart_event(5, CAPTURE, 3, "", 2),
         plan_changed(skipped),
@@ -70,12 +70,12 @@ def test_a_capture_that_was_begun_again_and_a_change_of_the_plan_count_once_be_t
     assert merge_recorded([BEGUN, again], items, []) == whole
     assert merge_recorded([BEGUN, skipped], items, []) == whole
     assert merge_recorded([BEGUN, again, skipped], items, []) == whole
-    other = Again(5, [WARM])
+    other = Restarted(5, [WARM])
     assert merge_recorded([BEGUN, other], items[:1], []) == [BEGUN, other, again]
 
 
 def test_of_an_instant_in_which_a_capture_is_begun_again_its_end_before_does_not_count_but_its_frame():
-    again = Again(5, [CAPTURE])
+    again = Restarted(5, [CAPTURE])
     items = [mark(5, CAPTURE, StepState.DONE)]
     assert merge_recorded([BEGUN, again], items, [(5, CAPTURE)]) == [
         BEGUN,

@@ -19,7 +19,6 @@ from thermostand.stand.running.executing.actions import (
     choose_next_action,
 )
 from thermostand.stand.running.memory.entries import (
-    Again,
     Begun,
     Cooled,
     Due,
@@ -29,8 +28,9 @@ from thermostand.stand.running.memory.entries import (
     Gap,
     Held,
     JournalEntry,
-    Readying,
+    Preparing,
     Reset,
+    Restarted,
     Restored,
     Skipped,
     Soaked,
@@ -49,7 +49,7 @@ KINDS = {
     StepChanged: st.tuples(ids, st.sampled_from(["started", "done"])),
     Soaked: st.tuples(ids, st.floats(0, 200)),
     Held: st.tuples(st.sampled_from(["operator", "interlock", "disk_low"]), st.booleans()),
-    Again: st.tuples(st.lists(ids, max_size=3), st.integers(0, 2)),
+    Restarted: st.tuples(st.lists(ids, max_size=3), st.integers(0, 2)),
     Skipped: st.tuples(ids),
     Extended: st.tuples(ids, st.floats(-5, 50)),
     Edited: st.tuples(st.integers(-1, 15), st.lists(st.sampled_from([soak, open_flap]), max_size=3)),
@@ -58,11 +58,11 @@ KINDS = {
     Ended: st.tuples(st.sampled_from(["stopped", "complete"]), st.just("text")),
     Taken: st.tuples(ids),
     Due: st.tuples(st.none() | st.integers(0, 100 * S), st.booleans()),
-    Readying: st.tuples(st.booleans()),
+    Preparing: st.tuples(st.booleans()),
     Restored: st.tuples(st.integers(0, 5)),
     Cooled: st.tuples(),
 }
-VOID = (Due, Readying, Restored, Cooled)  # not written, and void after a gap
+VOID = (Due, Preparing, Restored, Cooled)  # not written, and void after a gap
 
 
 @st.composite
@@ -133,7 +133,7 @@ def test_the_lines_of_a_journal_make_the_same_state(entries):
         Soaked(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
         Soaked(0, [], 1.0),  # pyright: ignore[reportArgumentType]
         StepChanged(0, {}, "done"),  # pyright: ignore[reportArgumentType]
-        Again(0, 7),  # pyright: ignore[reportArgumentType]
+        Restarted(0, 7),  # pyright: ignore[reportArgumentType]
         Extended(0, SOAK, "long"),  # pyright: ignore[reportArgumentType]
         Edited(0, "first", []),  # pyright: ignore[reportArgumentType]
         Edited(0, 13, [7]),  # pyright: ignore[reportArgumentType]

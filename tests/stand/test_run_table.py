@@ -45,7 +45,6 @@ from thermostand.stand.running.executing.actions import (
     credit_soaks,
 )
 from thermostand.stand.running.memory.entries import (
-    Again,
     Cooled,
     Due,
     Edited,
@@ -54,8 +53,9 @@ from thermostand.stand.running.memory.entries import (
     Extended,
     Gap,
     Held,
-    Readying,
+    Preparing,
     Reset,
+    Restarted,
     Restored,
     Skipped,
     Soaked,
@@ -146,7 +146,7 @@ EVENTS = {
     "tripped": ([Tripped(10 * S, "over_temperature", "too hot")], {"held": True}),
     "held 5 s": (held_for(10, 15), {}),
     "flap shut": (held_for(-60, 15), {"flap_open": False}),
-    "ready": ([*held_for(0, 70), Readying(70 * S, True)], {"now_ns": 80 * S}),
+    "ready": ([*held_for(0, 70), Preparing(70 * S, True)], {"now_ns": 80 * S}),
     "held 70 s": (held_for(0, 70), {"now_ns": 80 * S}),
     "interlock": ([Held(10 * S, INTERLOCK, True)], {"held": True}),
     "reset": (held_for(10, 15, INTERLOCK), {"flap_open": False}),
@@ -252,7 +252,7 @@ def test_what_is_restored_is_what_the_steps_before_have_set_up():
 def test_a_warm_up_begins_again_from_the_switch_that_made_it_cold_without_what_the_operator_did():
     again = choose_next_action(*met("warming up", "killed")).again
     assert [planned.step_id for planned in again] == [OFF, COOL, ON, WARM]
-    state = apply_entry(met("warming up", "killed")[0], Again(0, [OFF, COOL, ON, WARM]))
+    state = apply_entry(met("warming up", "killed")[0], Restarted(0, [OFF, COOL, ON, WARM]))
     assert (state.index, state.frames, state.is_setup_invalid, state.under_way) == (7, {}, True, "")
     assert isinstance(choose_next_action(state, Surroundings(20 * S)), Restore)
 
@@ -271,13 +271,13 @@ def test_a_capture_that_was_killed_and_stood_for_a_minute_is_taken_again():
         fold(PLAN, STATES["one frame"]),
         {"now_ns": 90 * S},
         (Gap(20 * S, 81 * S), Restore),
-        (Readying(81 * S, True), Restore),
+        (Preparing(81 * S, True), Restore),
         (Restored(85 * S, 1), ReopenFlap),
         ({"flap_open": True}, Begin),
-        (Readying(86 * S, False), Begin),
+        (Preparing(86 * S, False), Begin),
         (StepChanged(87 * S, CAPTURE, "started"), ArmCapture),
         (Due(88 * S, 88 * S), Retake),
-        (Again(90 * S, [CAPTURE]), TakeFrame),
+        (Restarted(90 * S, [CAPTURE]), TakeFrame),
         (StepChanged(90 * S, CAPTURE, "started"), TakeFrame),
         (Taken(91 * S, CAPTURE), TakeFrame),
         (Due(91 * S, 98 * S), Sleep),
@@ -293,7 +293,7 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
         {"now_ns": 30 * S, "flap_open": True},
         ({"frames_lost": 1, "held": True}, Wait),
         ({"held": False}, Retake),
-        (Again(30 * S, [CAPTURE]), TakeFrame),
+        (Restarted(30 * S, [CAPTURE]), TakeFrame),
         ({"frames_lost": 0}, TakeFrame),
         (StepChanged(30 * S, CAPTURE, "started"), TakeFrame),
         (Taken(31 * S, CAPTURE), TakeFrame),
@@ -305,11 +305,11 @@ def test_a_capture_of_which_the_disk_lost_frames_is_taken_again_when_nothing_hol
 def test_a_capture_is_taken_again_three_times_for_lost_frames_also_when_it_is_resumed_meanwhile():
     """A disk that loses frames each time does not hold the session for good."""
     around = Surroundings(30 * S, flap_open=True, frames_lost=1)
-    again = [Again(30 * S, [CAPTURE], 1), StepChanged(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
+    again = [Restarted(30 * S, [CAPTURE], 1), StepChanged(30 * S, CAPTURE, "started"), *[Taken(31 * S, CAPTURE)] * 2]
     entries = [*STATES["all frames"], *again, *again, Gap(32 * S, 33 * S), Restored(34 * S, 1)]
     twice = fold(PLAN, [*entries, StepChanged(35 * S, CAPTURE, "started")])
     assert choose_next_action(twice, around) == Retake(PLAN[5], "the disk has lost 1 of its frames", 1)
-    thrice = apply_entry(twice, Again(36 * S, [CAPTURE], 1))
+    thrice = apply_entry(twice, Restarted(36 * S, [CAPTURE], 1))
     assert isinstance(choose_next_action(fold(PLAN, []), around), Begin)
     for entry in again[1:]:
         thrice = apply_entry(thrice, entry)
@@ -378,11 +378,11 @@ def test_the_end_of_a_step_ends_what_is_under_way_only_when_that_is_it():
 
 def test_a_capture_of_which_a_step_before_is_done_again_is_neither_under_way_nor_has_lost_a_frame():
     before = fold(PLAN, STATES["one was lost"])
-    state = apply_entry(before, Again(0, [OPEN, CAPTURE]))
+    state = apply_entry(before, Restarted(0, [OPEN, CAPTURE]))
     assert (state.under_way, state.due_ns, state.is_lost) == ("", None, False)
     assert state.setup_invalidations == before.setup_invalidations + 1
     assert state.plan[state.index].step_id == OPEN
-    same = apply_entry(before, Again(0, [CAPTURE]))
+    same = apply_entry(before, Restarted(0, [CAPTURE]))
     assert (same.under_way, same.due_ns, same.is_lost, same.frames) == (CAPTURE, 20 * S, True, {})
     assert same.setup_invalidations == before.setup_invalidations
 
@@ -393,9 +393,9 @@ def test_an_outage_is_what_was_held_or_made_ready_since_the_last_frame_and_count
         Taken(0, CAPTURE),
         *held_for(5, 15),
         Held(20 * S, OPERATOR, True),
-        Readying(25 * S, True),
+        Preparing(25 * S, True),
         Held(30 * S, OPERATOR, False),
-        Readying(32 * S, False),
+        Preparing(32 * S, False),
     ]
     assert fold(PLAN, entries).outage_ns(50 * S) == 22 * S
     assert fold(PLAN, entries[:-1]).outage_ns(50 * S) == 40 * S

@@ -31,7 +31,7 @@ from thermostand.foundation.items import StepMark, StepState
 from thermostand.foundation.readings import Frame
 from thermostand.recording.format.journal_lines import parse_lines
 from thermostand.stand.running.executing.actions import CREDITED_WITHIN_K
-from thermostand.stand.running.memory.entries import Again, Soaked, StepChanged, decode
+from thermostand.stand.running.memory.entries import Restarted, Soaked, StepChanged, decode
 from thermostand.stand.running.memory.journal import JOURNAL_NAME
 from thermostand.stand.running.opening.stop import Interrupted
 from thermostand.stand.safety.fault import Fault
@@ -117,7 +117,7 @@ class RunMachine(RuleBasedStateMachine):
         since_ns = {
             step_id: entry.time_ns
             for entry in (self._entries() if self.life is not None else ())
-            if isinstance(entry, Again)
+            if isinstance(entry, Restarted)
             for step_id in entry.step_ids
         }
         frames = [item for item in self.disk if isinstance(item, Frame)]

@@ -24,7 +24,7 @@ from tests.stand.test_interface_access import book, free_port
 from thermostand.foundation.items import Event
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.stop_thread import StopThread
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 from thermostand.stand.serving.client import find_session_server
 from thermostand.stand.serving.secop import make_secop_listener
 
@@ -193,7 +193,7 @@ async def test_a_stop_that_ends_the_daemon_is_answered(tmp_path: Path, way: str)
     ended = asyncio.Event()
 
     class Ending(FakeService):
-        def stop(self, who: Who) -> str:
+        def stop(self, who: Requester) -> str:
             ended.set()
             return super().stop(who)
 

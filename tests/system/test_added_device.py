@@ -13,7 +13,7 @@ from tests.addresses import find_free_port
 from tests.installed import install, see_it_everywhere
 from thermostand.drivers.devices.device_check import Finding
 from thermostand.drivers.devices.kinds import load_built_in_kinds
-from thermostand.drivers.sim.fakes import FAKES, fake_of
+from thermostand.drivers.sim.fakes import FAKES, get_fake
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
 from thermostand.foundation.errors import ConfigError
@@ -65,14 +65,14 @@ def test_each_kind_of_device_has_its_fake_and_each_fake_its_kind():
         kind.section: kind.fakes if kind.fakes is not None else (kind.section,) for kind in load_built_in_kinds()
     }
     settings["regulator"] = ("regulator",)  # of the two kinds in that section, one has nothing to be simulated
-    fake_of("relays")
+    get_fake("relays")
     assert sorted(FAKES) == sorted(key for keys in settings.values() for key in keys)
 
 
 @pytest.mark.usefixtures("lamp")
 def test_a_fake_that_cannot_be_loaded_is_named_with_its_package():
     with pytest.raises(ConfigError, match=r"burnt: acme-lamp 1.0 cannot be loaded .*; reinstall it"):
-        fake_of("burnt")
+        get_fake("burnt")
 
 
 @pytest.fixture

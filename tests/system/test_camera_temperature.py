@@ -19,7 +19,7 @@ from thermostand.recording.reading.session import Session
 from thermostand.stand.commands.command_table import app
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.guarding.rules import watch_camera_temperature
-from thermostand.stand.running.memory.entries import Again, StepChanged
+from thermostand.stand.running.memory.entries import Restarted, StepChanged
 from thermostand.stand.running.memory.fold import apply_entry, fold
 from thermostand.stand.running.order import Order
 from thermostand.stand.service.run import run_virtual
@@ -148,8 +148,8 @@ def test_frames_are_to_come_until_the_last_capture_of_the_plan_is_done():
     assert state.frames_to_come
     state = apply_entry(state, StepChanged(0, "c", "done"))
     assert not state.frames_to_come
-    assert apply_entry(state, Again(0, ["c"])).frames_to_come
-    assert not apply_entry(state, Again(0, ["a"])).frames_to_come
+    assert apply_entry(state, Restarted(0, ["c"])).frames_to_come
+    assert not apply_entry(state, Restarted(0, ["a"])).frames_to_come
     assert not fold(plan[:1], []).frames_to_come
 
 

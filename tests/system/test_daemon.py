@@ -32,7 +32,7 @@ from thermostand.stand.running.run import Run
 from thermostand.stand.service.daemon import Daemon
 from thermostand.stand.service.daemon import serve as serve_stand
 from thermostand.stand.service.stand_service import DeviceRequest, StandService, SubmitRequest
-from thermostand.stand.serving.api_models import Conflict, StandState, Who
+from thermostand.stand.serving.api_models import Conflict, Requester, StandState
 from thermostand.stand.serving.client import Server, find_session_server
 
 LIMIT_S = 120.0  # for a busy machine
@@ -382,7 +382,7 @@ async def test_a_run_leaves_nothing_of_itself_in_the_daemon_and_nothing_is_heate
     laboratory: Path, tmp_path: Path
 ):
     """In this process, in which the daemon's objects can be counted and its record taken away."""
-    config, out, who = load_config(laboratory), tmp_path / "out", Who(name="a test", how="terminal")
+    config, out, who = load_config(laboratory), tmp_path / "out", Requester(name="a test", how="terminal")
     texts = {"config.yaml": laboratory.read_text(), "target.yaml": find_packaged("targets", config.target).read_text()}
     subscribers: list[int] = []
     lines: set[str] = set()

@@ -13,13 +13,13 @@ from thermostand.foundation.readings import bad_reading
 from thermostand.recording.reading.session import Session
 from thermostand.stand.service.idle_log import IdleLog
 from thermostand.stand.service.stand_service import DeviceRequest
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 
 
 async def test_midnight_changes_the_record_beneath_heat_by_hand(
     laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    out, who = tmp_path / "out", Who(name="a test", how="terminal")
+    out, who = tmp_path / "out", Requester(name="a test", how="terminal")
     day = ["20261122"]
     monkeypatch.setattr(IdleLog, "_get_today", lambda _: day[0])
     reported: list[Event] = []

@@ -28,7 +28,7 @@ from thermostand.stand.running.order import Order
 from thermostand.stand.service.daemon import Daemon, serve
 from thermostand.stand.service.run import Interrupted, run_virtual
 from thermostand.stand.service.stand_service import StandService, SubmitRequest
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 
 LIMIT_S = 90.0  # for what takes a few seconds, on a machine that has other things to do
 QUICK = {"timeout_s": 0.1}
@@ -137,7 +137,7 @@ async def test_a_daemon_that_is_ended_once_tries_beyond_the_time_after_which_a_s
     watcher = Watcher()
 
     async def broken(daemon: Daemon, desk: StandService) -> None:
-        await desk.submit(Who(name="a test", how="terminal"), SubmitRequest(recipe_text=SOAK))
+        await desk.submit(Requester(name="a test", how="terminal"), SubmitRequest(recipe_text=SOAK))
         await heater_is(ordered, 1)
         await fault(ordered, "bus.unplugged", True)
         daemon.leave()

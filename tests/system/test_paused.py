@@ -17,20 +17,20 @@ from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.running.order import Order
 from thermostand.stand.running.run_control import RunControl
 from thermostand.stand.service.stand_service import PauseRequest, StandService
-from thermostand.stand.serving.api_models import Done, Who
+from thermostand.stand.serving.api_models import CommandAnswer, Requester
 
 
 def service_of(assembly: Assembly) -> StandService:
     """Of a run of which only the stand is asked."""
     log, nothing = Logbook(assembly.hub, assembly.clock, fold((), ())), cast("Any", None)
     course = RunControl(assembly, Path("session"), Stop(), log, nothing, nothing, nothing)
-    guest, open_stand = SimpleNamespace(course=course), SimpleNamespace(assembly=assembly)
-    return StandService(cast("Any", SimpleNamespace(open_stand=open_stand, guest=guest)))
+    active_run, open_stand = SimpleNamespace(course=course), SimpleNamespace(assembly=assembly)
+    return StandService(cast("Any", SimpleNamespace(open_stand=open_stand, active_run=active_run)))
 
 
 def paused(service: StandService) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    done = service.perform("pause", Who(name="somebody", how="socket"), PauseRequest())
-    assert isinstance(done, Done)
+    done = service.perform("pause", Requester(name="somebody", how="socket"), PauseRequest())
+    assert isinstance(done, CommandAnswer)
     return done.reasons, done.moving
 
 

@@ -74,7 +74,7 @@ def iterate_rows(journal: Sequence[Mapping[str, Any]], steps: Mapping[str, str])
         match name:
             case "Step":
                 under_way = str(entry["step_id"]) if entry["state"] == "started" else ""
-            case "Skipped" | "Again" if under_way in (entry.get("step_id"), *entry.get("step_ids", ())):
+            case "Skipped" | "Restarted" if under_way in (entry.get("step_id"), *entry.get("step_ids", ())):
                 under_way = ""
             case "Held":
                 held = held | {entry["reason"]} if entry["held"] else held - {entry["reason"]}

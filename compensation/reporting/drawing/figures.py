@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 
 from thermostand.compensation.finding.workers import open_pool
 from thermostand.compensation.observations import Float, Observations
-from thermostand.compensation.reporting.tracks import thin
+from thermostand.compensation.reporting.tracks import choose_evenly
 
 I_COLOUR, J_COLOUR = "#0072B2", "#D55E00"
 CAMERA_COLOUR, GREY, WARM_UP_COLOUR = "#CC79A7", "#6b6b6b", "#F0E442"
@@ -273,7 +273,7 @@ def draw_trajectories(observations: Observations, shown: Sequence[PathPanel]) ->
         for panel, axes in zip(shown, places, strict=False):
             _draw_background(axes, observations, panel.start_px)
             axes.set_title(panel.title, fontsize=9, loc="left")
-            drawn = thin(len(panel.moved_px), _PATH_POINTS)
+            drawn = choose_evenly(len(panel.moved_px), _PATH_POINTS)
             path = panel.start_px + EXAGGERATION * panel.moved_px[drawn]
             colour = np.broadcast_to(panel.camera_degC[drawn][:, None], path.shape[:2])
             good = np.isfinite(path).all(axis=2)

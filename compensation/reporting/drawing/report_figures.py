@@ -41,8 +41,8 @@ from thermostand.compensation.reporting.tracks import (
     Rows,
     WarmUpTrack,
     average_over_markers,
+    choose_evenly,
     compute_displacement_px,
-    thin,
 )
 from thermostand.experiments.steps import Role
 from thermostand.markers.target import Target
@@ -60,7 +60,7 @@ def draw_warm_up_curves(observations: Observations, curves: Sequence[WarmUpTrack
     above, below = list[Panel](), list[Panel]()
     mean = "mean drift, " if len(curves) == 1 else ""
     for one, title in zip(curves, titles, strict=True):
-        drawn = thin(len(one.since_on_s), CURVE_POINTS)
+        drawn = choose_evenly(len(one.since_on_s), CURVE_POINTS)
         minutes = one.since_on_s[drawn] / _S_PER_MIN
         look: dict[str, Any] = {"linewidth": 0.9, "marker": "o" if len(drawn) <= 100 else None, "markersize": 2.4}
         drift = zip(COORDINATES, one.track.mean_px[drawn].T, strict=True)
@@ -123,7 +123,7 @@ def _mark_spots(observations: Observations, starts: Sequence[float]) -> Iterator
             times_ns, degC = session.spots[name]
             within = (times_ns >= own[0]) & (times_ns <= own[-1])
             hours = start + (times_ns[within] - own[0]) / _NS_PER_H
-            drawn = thin(len(hours), CURVE_POINTS)
+            drawn = choose_evenly(len(hours), CURVE_POINTS)
             colour = SPOT_COLOURS[number % len(SPOT_COLOURS)]
             yield make_curve(hours[drawn], degC[within][drawn], colour, None if index else name, linewidth=0.9)
 
@@ -144,7 +144,7 @@ def _compute_hours(observations: Observations) -> tuple[Float, list[float]]:
 def _split_runs(observations: Observations) -> list[Rows]:
     """Frames that a line may join: of one session, all drift or all of a moved target; thinned."""
     moved = np.isin(observations.role, TARGET_MOVED_ROLES).astype(int)
-    return [run[thin(len(run), CURVE_POINTS)] for run in _group_equal(2 * observations.session + moved)]
+    return [run[choose_evenly(len(run), CURVE_POINTS)] for run in _group_equal(2 * observations.session + moved)]
 
 
 def _group_equal(label: Rows) -> list[Rows]:
@@ -233,7 +233,7 @@ def draw_compensated_paths(observations: Observations, evaluation: Evaluation) -
 def draw_measured_against_model(evaluation: Evaluation) -> Figure:
     """Each scored centre: the drift that was measured against the drift that the model says."""
     measured, predicted = -evaluation.before_px, evaluation.after_px - evaluation.before_px
-    drawn = thin(len(measured), _MOST_DOTS)
+    drawn = choose_evenly(len(measured), _MOST_DOTS)
     shown: list[Panel] = []
     for index, (name, colour) in enumerate(COORDINATES):
         both = np.concatenate([predicted[:, index], measured[:, index]])
@@ -264,7 +264,7 @@ def draw_residuals(evaluation: Evaluation) -> Figure:
     interval."""
     camera_degC = evaluation.rows.camera_degC
     left_mpx = -1e3 * evaluation.after_px
-    drawn = thin(len(left_mpx), _MOST_DOTS)
+    drawn = choose_evenly(len(left_mpx), _MOST_DOTS)
     places = np.unique(camera_degC)
     claimed = np.array([evaluation.claimed_px2[camera_degC == degC].mean(axis=0) for degC in places])
     reach_mpx = 1e3 * _SIGMA_95 * np.sqrt(claimed)

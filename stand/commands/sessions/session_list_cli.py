@@ -18,7 +18,7 @@ from thermostand.foundation.command_app import App
 from thermostand.foundation.output import get_output, say, show
 from thermostand.foundation.usage import escape_line
 from thermostand.recording.format.inventory import list_segments
-from thermostand.recording.reading.catalogue import ListedSession, Report, load_catalogue, look_at
+from thermostand.recording.reading.catalogue import ListedSession, Report, inspect_session, load_catalogue
 from thermostand.recording.reading.notes import add_note, add_tags, check_tag, read_notes
 from thermostand.stand.commands.sessions.session_args import SessionArgument, check_folder, check_session
 from thermostand.stand.commands.sessions.session_table import (
@@ -63,7 +63,7 @@ def list_sessions(
 def list_sessions_at(directory: Path) -> list[ListedSession]:
     """`directory` itself when it is a session, else those in it."""
     if list_segments(directory):
-        return [look_at(directory)]
+        return [inspect_session(directory)]
     with ExitStack() as stack:
 
         def progress(count: int) -> Report:

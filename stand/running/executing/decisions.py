@@ -14,7 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thermostand.experiments.adaptive import Answer, Enough, Undecided, Visit, apply_decision, plan_fixed_visits
+from thermostand.experiments.adaptive import (
+    Answer,
+    CycleComplete,
+    DecisionPending,
+    Visit,
+    apply_decision,
+    plan_fixed_visits,
+)
 from thermostand.experiments.steps import Decide, PlannedStep
 from thermostand.foundation.clock import Clock
 from thermostand.foundation.errors import StandError
@@ -39,7 +46,7 @@ class Decision:
 
 async def keep_fixed_plan(decide: Decide) -> Decision:
     """The decision where nobody decides."""
-    return Decision(Undecided(), "nobody decides here")
+    return Decision(DecisionPending(), "nobody decides here")
 
 
 class Decider:
@@ -60,9 +67,9 @@ class Decider:
                 except BrokenPipeError:
                     return await self._ask_process(decide)
         except TimeoutError:
-            return Decision(Undecided(), f"the drift model was not fitted within {decide.wait_s:g} s")
+            return Decision(DecisionPending(), f"the drift model was not fitted within {decide.wait_s:g} s")
         except (OSError, StandError, ValueError) as error:
-            return Decision(Undecided(), getattr(error, "strerror", None) or str(error))
+            return Decision(DecisionPending(), getattr(error, "strerror", None) or str(error))
 
     async def _ask_process(self, decide: Decide) -> Decision:
         """BrokenPipeError when the process has ended."""
@@ -71,7 +78,9 @@ class Decider:
                 self._decides.__module__, (_LINE,), "the process that fits the drift model has ended"
             )
         except OSError as error:
-            return Decision(Undecided(), f"no process can be started that fits the drift model ({error.strerror})")
+            return Decision(
+                DecisionPending(), f"no process can be started that fits the drift model ({error.strerror})"
+            )
         lane = WorkerThread("design", self._clock, patient=False)
         try:
             return _parse_decision(await lane.call(self._call_process, helper, decide))
@@ -94,9 +103,9 @@ def _parse_decision(found: Mapping[str, Any]) -> Decision:
                 raise ValueError(f"a visit of {visit.chamber_degC} degC for {visit.soak_s} s was decided")
             return Decision(visit, reason)
         case "enough":
-            return Decision(Enough(), reason)
+            return Decision(CycleComplete(), reason)
         case _:
-            return Decision(Undecided(), reason)
+            return Decision(DecisionPending(), reason)
 
 
 def make_plan_change(state: RunState, planned: PlannedStep, decided: Decision, time_ns: int) -> Edited | None:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
 from contextlib import contextmanager
 
-from thermostand.experiments.adaptive import Undecided
+from thermostand.experiments.adaptive import DecisionPending
 from thermostand.experiments.steps import (
     AnySoak,
     Capture,
@@ -69,12 +69,12 @@ from thermostand.stand.running.executing.camera_gap import OffsetWatch
 from thermostand.stand.running.executing.decisions import Decision, keep_fixed_plan, make_plan_change
 from thermostand.stand.running.executing.settling_watch import SettlingWatch
 from thermostand.stand.running.memory.entries import (
-    Again,
     Change,
     Cooled,
     Due,
     Extended,
-    Readying,
+    Preparing,
+    Restarted,
     Restored,
     Skipped,
     Soaked,
@@ -354,7 +354,7 @@ class Executor:
             isinstance(action, ContinueSoak) and action.soak.step_id != state.plan[state.index].step_id
         )
         if is_readying != state.readying and not isinstance(action, Sleep):
-            self._log.enter(Readying(self._clock.now_ns(), is_readying))
+            self._log.enter(Preparing(self._clock.now_ns(), is_readying))
         try:
             await self._act(action)
         except (DeviceError, Interlocked) as error:
@@ -429,7 +429,7 @@ class Executor:
         frames = self._state.frames.get(step_ids[-1], 0)
         self._hub.publish(make_restart_event(now_ns, step_ids[-1], frames, how, frames_lost))
         await self._flushed()
-        await self._log.write(Again(now_ns, step_ids, frames_lost))
+        await self._log.write(Restarted(now_ns, step_ids, frames_lost))
 
     async def _perform(self, planned: PlannedStep) -> None:
         step = planned.step
@@ -441,7 +441,7 @@ class Executor:
         if self._state.is_decided(planned.step_id):
             return
         decided = await self._decider(step)
-        if isinstance(decided.answer, Undecided):
+        if isinstance(decided.answer, DecisionPending):
             self._log.tell(UNDECIDED, f"{decided.reason}; the fixed plan goes on")
         change = make_plan_change(self._state, planned, decided, self._clock.now_ns())
         if change is None:

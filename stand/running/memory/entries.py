@@ -14,11 +14,11 @@ journal (recording/format/journal_lines.py).
     Reset        an operator has removed the cause of a trip
     Ended        complete, stopped by the operator, tripped, or failed
 
-Not written: what the recording proves (Taken, Cooled), and what a Gap makes void (Due, Readying, Restored).
+Not written: what the recording proves (Taken, Cooled), and what a Gap makes void (Due, Preparing, Restored).
 
     Taken        a capture has a frame more
     Due          when the capture's next frame is due
-    Readying     the stand is being made ready for the next step, or is
+    Preparing    the stand is being made ready for the next step, or is
     Restored     the set-up of the steps so far has been brought about again
     Cooled       the camera was or may have been off
 
@@ -91,7 +91,7 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
-class Again:
+class Restarted:
     """These steps count as neither begun nor done from now on, and no frame of theirs before counts. frames_lost: by
     the disk, when it is for them."""
 
@@ -175,7 +175,7 @@ class Due:
 
 
 @dataclass(frozen=True, slots=True)
-class Readying:
+class Preparing:
     """The stand is being made ready from now on (`begins`) or was until now."""
 
     time_ns: int
@@ -197,12 +197,15 @@ class Cooled:
     time_ns: int
 
 
-JournalEntry = Begun | StepChanged | Soaked | Held | Gap | Again | Skipped | Extended | Edited | Tripped | Reset | Ended
-Entry = JournalEntry | Taken | Due | Readying | Restored | Cooled
+JournalEntry = (
+    Begun | StepChanged | Soaked | Held | Gap | Restarted | Skipped | Extended | Edited | Tripped | Reset | Ended
+)
+Entry = JournalEntry | Taken | Due | Preparing | Restored | Cooled
 Change = Skipped | Extended | Edited  # of the plan
 
 _ENTRY_CLASSES: dict[str, type[JournalEntry]] = {"Step": StepChanged} | {
-    kind.__name__: kind for kind in (Begun, Soaked, Held, Gap, Again, Skipped, Extended, Edited, Tripped, Reset, Ended)
+    kind.__name__: kind
+    for kind in (Begun, Soaked, Held, Gap, Restarted, Skipped, Extended, Edited, Tripped, Reset, Ended)
 }
 _NAMES = {kind: name for name, kind in _ENTRY_CLASSES.items()}
 

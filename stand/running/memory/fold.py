@@ -22,7 +22,6 @@ from thermostand.experiments.steps import (
 )
 from thermostand.foundation.clock import to_ns
 from thermostand.stand.running.memory.entries import (
-    Again,
     Change,
     Cooled,
     Due,
@@ -32,8 +31,9 @@ from thermostand.stand.running.memory.entries import (
     Extended,
     Gap,
     Held,
-    Readying,
+    Preparing,
     Reset,
+    Restarted,
     Restored,
     Skipped,
     Soaked,
@@ -69,11 +69,11 @@ def apply_entry(state: RunState, entry: Entry) -> RunState:
             return replace(state, due_ns=due_ns, is_lost=lost)
         case Held():
             return _apply_hold(state, entry)
-        case Readying(time_ns, begins):
+        case Preparing(time_ns, begins):
             return _count_outage(state, time_ns, state.reasons, readying=begins)
         case Gap():
             return _apply_gap(state, entry)
-        case Again():
+        case Restarted():
             return _apply_restart(state, entry)
         case Cooled():
             return replace(state, setup_invalidations=state.setup_invalidations + 1, is_cold=True)
@@ -257,7 +257,7 @@ def _apply_gap(state: RunState, entry: Gap) -> RunState:
     )
 
 
-def _apply_restart(state: RunState, entry: Again) -> RunState:
+def _apply_restart(state: RunState, entry: Restarted) -> RunState:
     """A capture under way is restarted where it is; for other steps what those before them set up is needed again."""
     ids, counts = frozenset(entry.step_ids), state.retakes
     lossy = {each: counts.get(each, 0) + 1 for each in entry.step_ids} if entry.frames_lost else {}

@@ -24,7 +24,7 @@ _ENDLESS_LOOK_S = 30.0  # of hours; not measured
 _AGAIN_S = 60.0  # after a try that failed: a jammed flap's motor must not be worn
 
 
-async def keep_shut_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
+async def keep_flap_closed_in_holds(stand: Stand, hub: Hub, clock: Clock) -> None:
     """Keep the flap shut in each hold, until cancelled. Events: `flap_shut_in_hold` and, when it does not close,
     `flap_not_shut` (an error)."""
     while True:

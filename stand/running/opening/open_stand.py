@@ -25,7 +25,7 @@ from thermostand.stand.config.stand_config import StandConfig
 from thermostand.stand.guarding.guard import Guard
 from thermostand.stand.guarding.interlocks import Recording
 from thermostand.stand.guarding.rules import Announcements
-from thermostand.stand.running.opening.holds import keep_shut_in_holds
+from thermostand.stand.running.opening.holds import keep_flap_closed_in_holds
 from thermostand.stand.running.opening.stand_lock import find_latch_file, lock_stand
 from thermostand.stand.running.opening.stop import Stop
 from thermostand.stand.safety.fault import Fault
@@ -81,7 +81,7 @@ class OpenStand:
         self.is_for_one = is_for_one
         self.background: list[asyncio.Task[None]] = []
         self.recorder: RunRecorder | None = None
-        self.guest: RunHandle | None = None
+        self.active_run: RunHandle | None = None
         self._announced = Announcements()
         self._guard: Guard | None = None
         self._pollers: tuple[Poller, ...] = ()
@@ -140,7 +140,7 @@ class OpenStand:
             *(poller.run() for poller in self._pollers),
             self.guard.run(),
             stand.chamber.permit_renewer.run(),
-            *((keep_shut_in_holds(stand, hub, clock),) if self.assembly.config.flap is not None else ()),
+            *((keep_flap_closed_in_holds(stand, hub, clock),) if self.assembly.config.flap is not None else ()),
             stand.imaging.supply.recovery.keep_open(),
         ]
         self._tasks.extend(map(asyncio.create_task, works))
@@ -193,9 +193,9 @@ class OpenStand:
         if self._guard is not None:
             self._guard.recording_ended()
 
-    def left(self) -> None:
+    def release_run(self) -> None:
         """The guest has gone, and what it alone was held for counts no more. A fault stays until it is reset."""
-        self.guest = None
+        self.active_run = None
         if self.is_for_one:
             return
         stand = self.assembly.stand
@@ -208,18 +208,20 @@ class OpenStand:
         stand.attended = False
 
     def _trip(self, fault: Fault) -> None:
-        if self.guest is None:
+        if self.active_run is None:
             return self._hold(fault)
-        return self.guest.trip(fault)
+        return self.active_run.trip(fault)
 
     def _hold(self, fault: Fault) -> None:
         self.latch.hold_gate()
-        if self.guest is not None:
-            self.guest.hold(fault)
+        if self.active_run is not None:
+            self.active_run.hold(fault)
 
     def _frames_are_due(self) -> bool:
         """Return whether frames are due from the camera, which is powered."""
-        return self.assembly.stand.imaging.supply.is_on and self.guest is not None and self.guest.frames_to_come
+        return (
+            self.assembly.stand.imaging.supply.is_on and self.active_run is not None and self.active_run.frames_to_come
+        )
 
     def _release(self) -> None:
         """The guard's hold is over. Of a folder that is lost another one is made."""

@@ -92,8 +92,8 @@ class Stop:
         if self._aborting is not None:
             await asyncio.wait([self._aborting])
 
-    def ended(self) -> None:
-        """The plan has ended, whichever way, and the stand is safe."""
+    def end(self) -> None:
+        """Note that the plan has ended, whichever way, and the stand is safe."""
         self._turn(PhaseTurn.END)
         if self.reason is not None:
             self.shutdown_deadline.begin()

@@ -31,7 +31,7 @@ from urllib.parse import urlsplit
 
 from thermostand.stand.config.interface_section import TokenFile
 from thermostand.stand.serving.api.stream import make_json
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 
 # The tokens of a stand as they are now: read at the start, and again when that is asked for.
 
@@ -107,7 +107,7 @@ class Denied(Exception):
 class _Login:
     """of: the token that has asked for it, None for none: then it was this machine's user."""
 
-    who: Who
+    who: Requester
     of: tuple[str, bool] | None = field(repr=False)
     until_s: float
 
@@ -127,14 +127,14 @@ class Access:
         self._codes: dict[str, _Login] = {}
         self._logins: dict[str, _Login] = {}
 
-    def make_login_code(self, who: Who, *, read_only: bool = False) -> str:
+    def make_login_code(self, who: Requester, *, read_only: bool = False) -> str:
         """A code that opens the page once, within ten minutes, for who asks for it, or for one who may only look."""
         now_s = time.monotonic()
         self._codes = {code: entry for code, entry in self._codes.items() if entry.until_s > now_s}
         while len(self._codes) >= _MOST_LOGINS:
             del self._codes[next(iter(self._codes))]
         code = secrets.token_urlsafe(24)
-        holder = Who(name=who.name, how="token", read_only=who.read_only or read_only)
+        holder = Requester(name=who.name, how="token", read_only=who.read_only or read_only)
         of = self._find_token(who.name) if who.how == "token" else None
         self._codes[_hash(code)] = _Login(holder, of, now_s + _LOGIN_S)
         return code
@@ -150,20 +150,20 @@ class Access:
         self._logins[_hash(cookie)] = replace(login, until_s=time.monotonic() + _SESSION_S)
         return cookie
 
-    def identify(self, scope: Scope) -> Who | None:
+    def identify(self, scope: Scope) -> Requester | None:
         """Return who asks; None when that has to be proved and is not. Denied when what is given as proof is none."""
         state, headers = cast("dict[str, Any]", scope.get("state") or {}), cast("Headers", scope["headers"])
         if state.get("door") == "socket":
-            return Who(name=get_user_name(state.get("uid")), how="socket")
+            return Requester(name=get_user_name(state.get("uid")), how="socket")
         found = self._identify_by_token(headers) or self._identify_by_cookie(headers)
         if found is not None:
             return found
         needs_token = self.tokens.known is not None and not self.trusts_loopback
         if needs_token or not _is_local(scope, headers):
             return None
-        return Who(name="", how="loopback", read_only=self.trusts_loopback == "read-only")
+        return Requester(name="", how="loopback", read_only=self.trusts_loopback == "read-only")
 
-    def admit(self, scope: Scope) -> Who:
+    def admit(self, scope: Scope) -> Requester:
         """Return who asks, if the client may ask anything at all; Denied otherwise."""
         self.check(scope)
         who = self.identify(scope)
@@ -171,7 +171,7 @@ class Access:
             raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
         if who is not None and who.read_only and _may_change(scope):
             raise Denied(403, f"{_describe_who(who)} may look and press STOP, but order nothing: it is read-only")
-        return who or Who(name="", how="network")
+        return who or Requester(name="", how="network")
 
     def check(self, scope: Scope) -> None:
         """Host and Origin; Denied."""
@@ -198,14 +198,14 @@ class Access:
         server = scope.get("server")
         return bool(server) and str(ip) == str(server[0]).partition("%")[0]  # an address cannot be rebound
 
-    def _identify_by_token(self, headers: Headers) -> Who | None:
+    def _identify_by_token(self, headers: Headers) -> Requester | None:
         given = _get_all(headers, b"authorization")
         if not given:
             return None
         kind, _, token = given[0].partition(" ")
         found, known = _hash(token.strip()), self.tokens.known or TokenFile()
         matches = [
-            Who(name=name, how="token", read_only=read_only)
+            Requester(name=name, how="token", read_only=read_only)
             for name, (each, read_only) in known.list_by_name().items()
             if hmac.compare_digest(_hash(each), found)
         ]
@@ -213,7 +213,7 @@ class Access:
             raise Denied(401, "the Authorization header has no token of this stand")
         return matches[0]
 
-    def _identify_by_cookie(self, headers: Headers) -> Who | None:
+    def _identify_by_cookie(self, headers: Headers) -> Requester | None:
         cookie = next((value for name, value in _parse_cookies(headers) if name == COOKIE), None)
         login = self._logins.get(_hash(cookie)) if cookie else None
         return login.who if login is not None and self._is_valid(login) else None
@@ -397,7 +397,7 @@ def _may_change(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] not in _READS and scope["path"] not in _CHANGES_NOTHING
 
 
-def _describe_who(who: Who) -> str:
+def _describe_who(who: Requester) -> str:
     return f"the token of {who.name}" if who.how == "token" else "this machine, without a token,"
 
 

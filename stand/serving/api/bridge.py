@@ -27,7 +27,7 @@ from thermostand.foundation.events import COMMAND
 from thermostand.foundation.items import Event, Item, Original, StepMark
 from thermostand.foundation.readings import Frame
 from thermostand.foundation.tasks import describe_failure
-from thermostand.stand.serving.api_models import Done, PlanCheck, PlanStep, StandState, Who, WrittenStep
+from thermostand.stand.serving.api_models import CommandAnswer, PlanCheck, PlanStep, Requester, StandState, WrittenStep
 from thermostand.stand.serving.commands import STOP, Served
 
 _REFRESH_S = 0.5  # twice a second, as often as a person sees a change
@@ -147,24 +147,24 @@ class Bridge:
         self._post(lambda: self._call(call, answer))
         return await _wait_within(limit_s, asyncio.wrap_future(answer))
 
-    async def perform(self, name: str, who: Who, given: Document | None = None) -> BaseModel:
+    async def perform(self, name: str, who: Requester, given: Document | None = None) -> BaseModel:
         """Do a command, as `ask`; Done has the number of its event."""
         return await self.ask(self._perform_numbered(name, who, given))
 
     def _perform_numbered(
-        self, name: str, who: Who, given: Document | None
+        self, name: str, who: Requester, given: Document | None
     ) -> Callable[[Served], Awaitable[BaseModel]]:
         async def numbered(service: Served) -> BaseModel:
             before = self._command_seq
             came = service.perform(name, who, given)
             came = await came if inspect.isawaitable(came) else came
             self._refresh_within(0.0)
-            is_numbered = isinstance(came, Done) and self._command_seq > before
+            is_numbered = isinstance(came, CommandAnswer) and self._command_seq > before
             return came.model_copy(update={"seq": self._command_seq}) if is_numbered else came
 
         return numbered
 
-    def request_stop(self, who: Who) -> concurrent.futures.Future[BaseModel]:
+    def request_stop(self, who: Requester) -> concurrent.futures.Future[BaseModel]:
         """The stop that is on its way, begun if there is none; from any thread. One that follows another within 0.1 s
         is done when these are over, with all that came until then. It ends as `ask`, but without a limit, and is not
         to be cancelled: a thousand who stop share it."""
@@ -177,7 +177,7 @@ class Bridge:
                     stopping.set_exception(error)
             return self._stopping
 
-    async def stop(self, who: Who) -> BaseModel:
+    async def stop(self, who: Requester) -> BaseModel:
         """Stop, as `stopping`. NoAnswer as `ask`."""
         stopping = asyncio.wrap_future(self.request_stop(who))
         stopping.add_done_callback(lambda each: each.cancelled() or each.exception())  # others have it, too
@@ -215,7 +215,7 @@ class Bridge:
         except RuntimeError:  # it is closed
             raise NoAnswer("the daemon has ended") from None
 
-    def _begin_stop(self, who: Who, stopping: concurrent.futures.Future[BaseModel]) -> None:
+    def _begin_stop(self, who: Requester, stopping: concurrent.futures.Future[BaseModel]) -> None:
         """Begin the stop, on the control loop."""
         if (wait_s := self._stopped_s + _STOPPED_S - time.monotonic()) > 0.0:
             self._loop.call_later(wait_s, self._begin_stop, who, stopping)

@@ -16,7 +16,7 @@ from thermostand.foundation.documents import Document
 from thermostand.stand.serving.api.access import COOKIE, INVITE_PATH, LOGIN_PATH, Access
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer, StateSnapshot
 from thermostand.stand.serving.api.stream import EVENTS, MOST_VIEWERS, Stream, make_json
-from thermostand.stand.serving.api_models import PlanStep, StandState, Who
+from thermostand.stand.serving.api_models import PlanStep, Requester, StandState
 
 # The stand's numbers in the text format of Prometheus (version 0.0.4), written by hand: twenty lines against a library
 # whose registry of global counters would be a second memory of the same numbers.
@@ -230,7 +230,7 @@ def _add_logins(router: APIRouter, access: Access, url: str) -> None:
         answer.set_cookie(COOKIE, cookie, max_age=30 * 86400, httponly=True, samesite="strict", path="/")
         return answer
 
-    @router.get("/api/v1/who", response_model=Who)
+    @router.get("/api/v1/who", response_model=Requester)
     async def who(request: Request) -> Response:
         """Return as whom the stand knows you, and whether you may only look."""
         return _make_response(request.state.who.model_dump_json())

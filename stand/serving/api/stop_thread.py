@@ -35,10 +35,10 @@ from thermostand.stand.serving.api.access import (
     make_last_refusal,
 )
 from thermostand.stand.serving.api.bridge import COMMAND_LIMIT_S, NoAnswer, make_no_answer
-from thermostand.stand.serving.api_models import Who
+from thermostand.stand.serving.api_models import Requester
 
 ListenerKind = Literal["stop", "socket", "tcp"]
-Stopping = Callable[[Who], "concurrent.futures.Future[BaseModel]"]
+Stopping = Callable[[Requester], "concurrent.futures.Future[BaseModel]"]
 
 # Chosen with `python -m tests.bench stop`: under a flood of connections STOP takes 227 to 412 ms, of silent ones
 # 39 to 182, with 2,000 open sockets 1.6 (medians).
