@@ -71,7 +71,7 @@ def _describe_model(model: Schema) -> Iterator[str]:
 
 
 def _describe_kind(value: Schema) -> str:
-    """What may stand there; models as links to their sections."""
+    """Return what may stand there; models as links to their sections."""
     if "$ref" in value:
         name = str(value["$ref"]).rpartition("/")[2]
         return f"[{name}](#{name.lower()})"
@@ -98,7 +98,7 @@ def _describe_bounds(value: Schema) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    """No line of it is taken for Markdown's own."""
+    """Escape a text so that no line of it is taken for Markdown's own."""
     return " ".join(text.split()).replace("<", "&lt;").replace("*", "\\*")
 
 

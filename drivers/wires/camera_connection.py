@@ -99,7 +99,7 @@ def _list_usual_features(device: GigeDevice) -> list[TemperatureFeature]:
 
 
 def describe_place(device: GigeDevice, place: TemperatureFeature) -> str:
-    """Where that is, and what the camera offers for its selector, in words."""
+    """Return where that is, and what the camera offers for its selector, in words."""
     return f"{_describe_place(place)}{_describe_offered(device, place)}"
 
 
@@ -110,7 +110,8 @@ def _describe_place(place: TemperatureFeature) -> str:
 
 
 def _describe_offered(device: GigeDevice, place: TemperatureFeature) -> str:
-    """What the camera offers for the selector, as the end of a sentence; "" when there is none, or it does not say."""
+    """Return what the camera offers for the selector, as the end of a sentence; "" when there is none, or it does not
+    say."""
     try:
         entries = device.entries(place.selector) if place.selector is not None else ()
     except AravisError:

@@ -201,19 +201,20 @@ def make_devices(config: StandConfig, bus: Bus, hub: Hub, clock: Clock) -> Devic
 
 
 def _get_display_name(sensor: Sensor, config: StandConfig) -> str:
-    """What a device with several temperatures is called, so that it is found."""
+    """Return what a device with several temperatures is called, so that it is found."""
     if not isinstance(sensor, Thermometers):
         return sensor.name
     return f"{sensor.name} (unit {sensor.unit} at {config.bus.address})"
 
 
 def list_device_kinds(config: StandConfig) -> dict[str, str]:
-    """What the stand is made of: name -> kind, but for what is in the place of a device and never read."""
+    """Return what the stand is made of: name -> kind, but for what is in the place of a device and never read."""
     return {each.name: each.kind.name for each in config.equipment if each.poll_s is not None}
 
 
 def list_recorded_devices(config: StandConfig) -> dict[str, RecordedDevice]:
-    """What is recorded of each device that is read, by name; ConfigError when one declares what cannot be recorded."""
+    """Return what is recorded of each device that is read, by name; ConfigError when one declares what cannot be
+    recorded."""
     return {
         each.name: RecordedDevice(
             each.kind.name, each.channels(partial(getattr, config), load_unit_map), each.kind.is_opened

@@ -54,7 +54,7 @@ class MovementChecks:
         assembly.hub.subscribe(self._follow)
 
     async def of(self, each: Equipment) -> None:
-        """What moves of this device; from now on it is made safe at the end."""
+        """Check what moves of this device; from now on it is made safe at the end."""
         device = self._assembly.devices.every[each.name]
         if each.name in self._opened and hasattr(device, "make_safe"):
             self._assembly.stand.opened(cast("Actuator", device))
@@ -214,7 +214,7 @@ class MovementChecks:
             self._add(Finding(name, "temperature", "failed", temperature.reason, to_do))
 
     async def _measure_offset_K(self) -> float:
-        """How far the chamber's air is from the laboratory; 0 when it is near, or not known."""
+        """Return how far the chamber's air is from the laboratory; 0 when it is near, or not known."""
         devices = self._assembly.devices
         if devices.thermometers.name not in self._opened:
             return 0.0

@@ -103,7 +103,7 @@ def _load(point: EntryPoint) -> tuple[Callable[[BaseModel], object], type[BaseMo
 
 
 def _find_fault(step: object) -> str:
-    """Why this is no step that a stand can do; "" when it is one."""
+    """Return why this is no step that a stand can do; "" when it is one."""
     if not isinstance(step, Step):
         return f"is no step of thermostand.experiments.steps but {type(step).__name__}"
     for name in [field.name for field in fields(cast("Any", step))]:

@@ -134,8 +134,8 @@ CHANNEL_SILENT = guard_rule("channel_silent", "a channel with limits in `guard.c
 
 
 def limit_watches(limited: Mapping[str, ChannelLimits]) -> Iterator[Watch]:
-    """What is looked at for the limits of these channels. Without a reading nobody knows whether a limit is kept: that
-    waits for an operator, but it does not end a run."""
+    """Return what is looked at for the limits of these channels. Without a reading nobody knows whether a limit is
+    kept: that waits for an operator, but it does not end a run."""
     for channel, limits in limited.items():
         yield Watch(_outside(channel, limits), limits.after_s, DONE[limits.action])
         yield Watch(

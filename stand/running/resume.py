@@ -94,7 +94,7 @@ class Difference:
 
 
 def load_default_stand() -> StandConfig:
-    """When no configuration is named: the installed simulated one, as for a new run."""
+    """Load the installed simulated stand when no configuration is named, as for a new run."""
     return load_config(find_packaged("", "simulated"))
 
 

@@ -76,7 +76,7 @@ class _SafeStateTask:
             self._task = asyncio.create_task(self._until_confirmed())
 
     def pending(self) -> Pending | None:
-        """What is not confirmed yet; None when what was demanded is."""
+        """Return what is not confirmed yet; None when what was demanded is."""
         is_confirmed = self.confirmed == self.demanded
         return None if is_confirmed else Pending(self._actuator.name, self._since_ns, self.failure)
 
@@ -105,7 +105,7 @@ class _SafeStateTask:
                 await self._pause()
 
     async def _try(self) -> str:
-        """Why it is not confirmed, "" when it is; after a lost answer it is called a second time at once."""
+        """Return why it is not confirmed, "" when it is; after a lost answer it is called a second time at once."""
         name = self._actuator.name
         try:
             async with asyncio.timeout(TRY_LIMIT_S):

@@ -83,7 +83,7 @@ from thermostand.stand.service.run import run_on_stand
 from thermostand.stand.service.run_queue import RunQueue, make_note
 from thermostand.stand.service.stand_service import StandService
 from thermostand.stand.serving.alerts import send_alerts
-from thermostand.stand.serving.api_models import Conflict, QueuedRun, Who
+from thermostand.stand.serving.api_models import Conflict, QueuedRun, Requester
 from thermostand.stand.serving.preview_process import MODULE
 
 # What answers the clients of a stand while inside.
@@ -332,7 +332,9 @@ class Daemon(Host):
         async def recorded(folder: Path) -> None:
             await notes.begun(folder)
             begun()
-            if session is None and (text := make_note(Who(name=entry.added_by, how="queue"), entry.note, entry.tags)):
+            if session is None and (
+                text := make_note(Requester(name=entry.added_by, how="queue"), entry.note, entry.tags)
+            ):
                 try:
                     await save_note(text, folder, orders.notes, hub, clock)
                 except SessionError as error:
@@ -446,7 +448,7 @@ class Daemon(Host):
         except (SessionError, OSError) as error:
             self._publish(IDLE_LOG_NOT_ENDED, f"today's record is not begun, yesterday's goes on: {error}")
             return
-        if self.open_stand.guest is None:
+        if self.open_stand.active_run is None:
             self.open_stand.recorder = recorder
         try:
             await self.record.complete(FINISH_WITHIN_S)

@@ -13,8 +13,8 @@ from thermostand.drivers.sim.units.regulator import (
     Gains,
     Outputs,
     Side,
+    compute_outputs,
     on_time_ns,
-    outputs_of,
     resume,
     start,
     step,
@@ -119,9 +119,9 @@ def approx(heat_pct: float, cool_pct: float) -> Outputs:
 
 def test_a_dead_band_is_silent_and_an_overlap_drives_both_sides() -> None:
     gains = Gains(heat=P_ONLY, cool=P_ONLY, dead_band_K=1.0)
-    assert outputs_of(0.4, gains) == outputs_of(-0.4, gains) == OFF
-    assert outputs_of(0.9, gains) == approx(10.0, 0.0)
-    assert outputs_of(0.0, replace(gains, dead_band_K=-0.8)) == approx(10.0, 10.0)
+    assert compute_outputs(0.4, gains) == compute_outputs(-0.4, gains) == OFF
+    assert compute_outputs(0.9, gains) == approx(10.0, 0.0)
+    assert compute_outputs(0.0, replace(gains, dead_band_K=-0.8)) == approx(10.0, 10.0)
 
 
 def test_limits_hold_and_the_integral_does_not_wind_up_behind_them() -> None:

@@ -20,7 +20,7 @@ from thermostand.stand.service import systemd
 from thermostand.stand.service.counters import Counters, CountersFile, StoredCounters, load_counters
 from thermostand.stand.service.daemon import ReportQueue
 from thermostand.stand.service.run_queue import RunQueue
-from thermostand.stand.serving.api_models import Conflict, RunRequest, Who
+from thermostand.stand.serving.api_models import Conflict, Requester, RunRequest
 
 
 def read(hub: Hub, time_s: float, **values: float) -> None:
@@ -145,7 +145,7 @@ async def test_a_run_is_queued_only_when_what_it_needs_answers(tmp_path: Path):
     }
     hub = Hub()
     open_stand = OpenStand(assemble(config, hub, clock), disk, ShutdownDeadline(), is_for_one=False)
-    orders, who = RunQueue(open_stand, disk, tmp_path, "simulated", texts), Who(name="rose", how="token")
+    orders, who = RunQueue(open_stand, disk, tmp_path, "simulated", texts), Requester(name="rose", how="token")
     now_ns, request = clock.now_ns(), RunRequest(recipe="warm-up")
     hub.publish(Batch("x", now_ns, (bad_reading("thermometers.air", "degC", now_ns, "no answer", "wire"),)))
     with pytest.raises(Conflict, match=r"thermometers\.air is not read"):

@@ -66,8 +66,8 @@ class PulsesSettings(Document):
 
 
 def compute_pulse_s(percent: float, carry_s: float, settings: PulsesSettings) -> tuple[float, float]:
-    """How long the relay is on in the coming cycle (cycle_s: all of it), and what remains to be given (s, less than 0
-    when too much was given): what was rounded, or left out, of the output's share."""
+    """Return how long the relay is on in the coming cycle (cycle_s: all of it), and what remains to be given (s, less
+    than 0 when too much was given): what was rounded, or left out, of the output's share."""
     wanted_s = percent / 100 * settings.cycle_s + carry_s
     given_s = round(min(settings.cycle_s, max(0.0, wanted_s)) / _STEP_S) * _STEP_S
     if given_s < settings.min_on_s:
@@ -124,7 +124,7 @@ class HeatPulses:
         self._until_ns, self._is_compared = self._clock.now_ns() + to_ns(hold_s), True
 
     async def off(self) -> None:
-        """No heat, confirmed; DeviceError."""
+        """Stop all heat and confirm it; DeviceError when that fails."""
         self._due_ns, self._carry_s = 0, 0.0
         await self._off()
 

@@ -121,10 +121,12 @@ def step(
     integral_K = state.integral_K
     if side.integral_s > 0 and not _saturates(demand_K, error_K, gains):
         integral_K += error_K * dt_s / side.integral_s
-    return outputs_of(demand_K, gains), PidState(reference_degC, integral_K, measured_degC, slope_K_per_s, demand_K)
+    return compute_outputs(demand_K, gains), PidState(
+        reference_degC, integral_K, measured_degC, slope_K_per_s, demand_K
+    )
 
 
-def outputs_of(demand_K: float, gains: Gains) -> Outputs:
+def compute_outputs(demand_K: float, gains: Gains) -> Outputs:
     """A demand (K, heating positive) as the two limited outputs."""
     half_K = gains.dead_band_K / 2
     return Outputs(
@@ -134,7 +136,8 @@ def outputs_of(demand_K: float, gains: Gains) -> Outputs:
 
 
 def on_time_ns(begin_ns: int, end_ns: int, duty: float, period_ns: int) -> int:
-    """How long a time-proportioned output conducts within [begin, end): each period begins with duty x period on.
+    """Return how long a time-proportioned output conducts within [begin, end): each period begins with duty x period
+    on.
 
     Times are counted from the begin of the first period, duty is 0..1.
     """

@@ -162,38 +162,38 @@ class SoakRunner:
         return self._log.state
 
     def _is_interrupted(self) -> bool:
-        """Whether the soak time stands still."""
+        """Return whether the soak time stands still."""
         return bool(self._gate.reasons) or self._state.is_setup_invalid
 
     def _compute_judgement_ns(self, step: AnySoak, soaked_ns: int) -> int:
-        """How long until a soak with so much soak time may end, ns."""
+        """Return how long until a soak with so much soak time may end, ns."""
         if not isinstance(step, Soak):
             return _JOURNAL_NS
         short_ns = to_ns(step.duration_s) - soaked_ns
         return short_ns if short_ns > 0 else max(NS_PER_S, to_ns(self._measure_missing_s(step)))
 
     async def _has_ended(self, step: AnySoak, step_id: str, soaked_s: float) -> bool:
-        """Whether a soak, so old, may end now."""
+        """Return whether a soak, so old, may end now."""
         if isinstance(step, Soak):
             return soaked_s >= step.duration_s and not self._measure_missing_s(step)
         return await self._settling.is_settled(step, step_id, soaked_s)
 
     def _measure_missing_s(self, step: AnySoak) -> float:
-        """What the chamber was not in the band in the last part before now, s; 0 also when the soak has no band, or the
-        chamber is stopped."""
+        """Return what the chamber was not in the band in the last part before now, s; 0 also when the soak has no band,
+        or the chamber is stopped."""
         band_K, chamber_degC = step.guaranteed_K, self._state.set_up.chamber_degC
         if not band_K or chamber_degC is None:
             return 0.0
         return max(0.0, step.last_part_s - self._settling.in_band_s(chamber_degC, band_K))
 
     def _report_extension(self, step: Soak, soak: PlannedStep, soaked_s: float) -> float:
-        """That it goes on beyond its time; returned is for how long at least, s."""
+        """Report that the soak goes on beyond its time; returned is for how long at least, s."""
         by_s = min(self._measure_missing_s(step), get_duration_ns(soak) / NS_PER_S - soaked_s)
         self._log.tell(SOAK_LONGER, self._describe_chamber(step), step_id=soak.step_id, by_s=by_s)
         return by_s
 
     def _describe_chamber(self, step: AnySoak) -> str:
-        """Where the chamber was."""
+        """Describe in words where the chamber was."""
         chamber_degC, last_s = self._state.set_up.chamber_degC, step.last_part_s
         was_s = last_s - self._measure_missing_s(step)
         place = f"within {step.guaranteed_K:g} K of {chamber_degC} degC"
