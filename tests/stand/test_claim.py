@@ -229,7 +229,7 @@ async def test_of_several_that_begin_at_once_one_gets_it_and_its_death_gives_it_
     processes = [start() for _ in range(3)]
     answers = {process.pid: process.stdout.readline() for process in processes if process.stdout is not None}
     (holder,) = [process for process in processes if answers.pop(process.pid) == "has it\n"]
-    assert all(f"session /their/night (pid {holder.pid})" in line for line in answers.values())
+    assert all(f"session /their/cycle (pid {holder.pid})" in line for line in answers.values())
     holder.send_signal(signal.SIGSTOP)
     assert not await is_free(config())
     holder.kill()

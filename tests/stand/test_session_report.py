@@ -37,5 +37,5 @@ def test_a_session_across_a_gap_is_reported_by_hand_with_the_option_that_allows_
         raise MixedEquilibria("its frames are of two equilibria")
 
     monkeypatch.setattr(report, "analyse", refused)
-    with pytest.raises(NotReported, match=r"night --across-gap -o report\.html` tries again$"):
+    with pytest.raises(NotReported, match=r"cycle --across-gap -o report\.html` tries again$"):
         report_session(tmp_path / "cycle", tmp_path)

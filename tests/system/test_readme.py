@@ -118,7 +118,7 @@ def test_every_command_of_the_tutorial_runs_in_an_empty_folder(tmp_path: Path):
     (tmp_path / "points.csv").write_text("x_px,y_px\n1200,1000\n")
     (tmp_path / "details.yaml").write_text("lens: 25 mm f/1.4\n")
     (tmp_path / "cycle.yaml").write_text(VALIDATION)
-    session = run(".venv/bin/stand run night.yaml --virtual-time --out nights", tmp_path).strip()
+    session = run(".venv/bin/stand run cycle.yaml --virtual-time --out sessions-of-cycle", tmp_path).strip()
     run(".venv/bin/stand demo", tmp_path)
     printed: dict[str, str] = {}
     for command in typed():
