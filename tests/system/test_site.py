@@ -54,6 +54,24 @@ def test_the_files_of_the_architecture_exist():
     assert [row for row in rows if not (ROOT / row).is_file()] == []
 
 
+def test_each_device_of_the_hardware_status_has_its_source_and_tests():
+    """Pages and sections that the table names stand in the device's own file, and its tests exist."""
+    text = (ROOT / "docs/explanation/hardware-status.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in text.splitlines() if row.startswith("| ")][
+        1:
+    ]
+    assert len(rows) == 22
+    for device, read, _, _, _, file, tests in rows:
+        (home,) = (
+            [ROOT / "configs" / file.strip("`")] if "/" in file else (ROOT / "drivers/devices").rglob(file.strip("`"))
+        )
+        source = home.read_text(encoding="utf-8")
+        assert [
+            number for number in re.findall(r"p\. ([\d-]+)|\b(\d-\d)\b", read) if max(number) not in source
+        ] == [], device
+        assert (ROOT / "tests" / f"{tests.strip('`')}.py").is_file(), device
+
+
 def test_no_page_loads_anything_from_elsewhere(site: Path):
     loads = re.compile(
         r"""<(?:script|img|iframe)[^>]+src="(https?:)?//|<link[^>]+rel="stylesheet"[^>]+href="(https?:)?//"""
