@@ -131,7 +131,7 @@ def make_identity_event(device: str, identity: Identity, now_ns: int, camera: Ca
     data: dict[str, object] = {"device": device, **asdict(identity)}
     text = str(identity)
     if not identity.serial_number:
-        text += "; it tells no serial number"
+        text += "; it reports no serial number"
     if camera is not None:
         data["lens"] = camera.lens
         text += f", lens {camera.lens}" if camera.lens else ", its lens is not stated"

@@ -533,7 +533,7 @@ QUEUE_EMPTY = event("queue_empty", "info", "all that was queued is done", alert=
 NOT_RESUMED = event("not_resumed", "error", "run {run} is not resumed by itself: {text}",
     "`stand reset`, then `stand resume`")
 RECORDING_RESTARTED = event("recording_restarted", "warning", "{session}: its writer was killed; the run is resumed",
-    "see what killed it: `journalctl -k` tells of a lack of memory")
+    "see what killed it: `journalctl -k` reports a lack of memory")
 IDLE_LOG_NOT_RECORDED = event("idle_log_not_recorded", "error",
     "nothing is recorded between runs, so nothing is heated: {text}", _SEE_DISK)
 IDLE_LOG_NOT_ENDED = event("idle_log_not_ended", "warning", "{text}", _SEE_DISK)

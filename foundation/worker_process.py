@@ -103,7 +103,7 @@ class WorkerProcess:
         return False
 
     async def _wait_for_end(self) -> None:
-        while self._process.poll() is None:  # noqa: ASYNC110 - it tells nobody that it has ended
+        while self._process.poll() is None:  # noqa: ASYNC110 - nothing notifies of its end
             await asyncio.sleep(_LOOK_S)
 
     def _release(self) -> None:

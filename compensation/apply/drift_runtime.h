@@ -24,7 +24,7 @@ enum {
 
 typedef struct drift_state {
     int begun;  /* 0 in a gap */
-    int unseen; /* 1 from a begin without power or temperature, until the camera tells one */
+    int unseen; /* 1 from a begin without power or temperature, until the camera reports one */
     double settled_s, on_s;
     double values[DRIFT_VALUES]; /* degC of the camera and of the air, the supply, then lags and plays */
     unsigned flags;                /* of the state, for every position */

@@ -134,10 +134,10 @@ _FADING_S = (900.0, 3600.0, 14400.0)
 # found the session is looked at again minute by minute.
 _MOST_INSTANTS = 160
 _SAME_PLACE_PX = 10.0  # no drift is as large: the camera was moved or rolled
-_INSTANT_NS = 60 * NS_PER_S  # one minute: the time to which a bump is told apart
+_INSTANT_NS = 60 * NS_PER_S  # one minute: the time to which a bump is resolved
 _FEWEST = 8  # instants; fewer tell nothing of a step
 _QUICK_S = 1200.0
-"""So soon after switching on the image moves faster than any lag of these tells."""
+"""So soon after switching on the image moves faster than any of these lags follows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -108,7 +108,8 @@ def open_pool(workers: int) -> Generator[ProcessPoolExecutor]:
 
 
 def _initialise_worker() -> None:
-    """One thread, and no longer than the process that gives the work: a pool tells nobody that its owner was killed."""
+    """One thread, and no longer than the process that gives the work: nobody is notified when the owner of a pool was
+    killed."""
     cv2.setNumThreads(1)
     threading.Thread(target=_end_with_owner, daemon=True).start()
 

@@ -153,7 +153,7 @@ async def _check_in_force(look: DeviceCheck, controller: Controller) -> None:
     except DeviceError as error:
         look.found("in force", "failed", error.text, "look at the unit")
         return
-    data, known = asdict(found), f"known by: {found.known_by}" if found.known_by else "not known: nothing tells it"
+    data, known = asdict(found), f"known by: {found.known_by}" if found.known_by else "not known: nothing reports it"
     if found.objections:
         text = f"its set-point is not in force: {'; '.join(found.objections)}"
         look.found("in force", "failed", text, "nothing is heated until it is", data)
@@ -169,11 +169,11 @@ def _classify_error(error: StandError) -> str:
 
 
 def check_identity(device: Device) -> Finding:
-    """Return what a device that answers tells of itself, and what it does not."""
+    """Return what a device that answers reports of itself, and what it does not."""
     identity = device.identity
     if identity is None:
         return Finding(device.name, "identity", "ok", "answers; it does not tell what it is")
-    text = str(identity) if identity.serial_number else f"{identity}; it tells no serial number"
+    text = str(identity) if identity.serial_number else f"{identity}; it reports no serial number"
     return Finding(device.name, "identity", "ok", text, data=asdict(identity))
 
 

@@ -133,7 +133,7 @@ CONTROLLED = (
     Channel("running", "1", "flag"),
     Channel("fault", "1", "flag"),
 )
-"""What every controller of the chamber's temperature tells."""
+"""What every controller of the chamber's temperature reports."""
 CONTROL = (
     Verb(
         "set",

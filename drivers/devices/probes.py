@@ -2,8 +2,8 @@
 
 hart: Fluke Calibration / Hart Scientific 1502A, 1504 and their like. T -> `t:   25.587 C`; *IDN? -> maker, model,
 serial number, version (1504 user's guide, 7.3). vaisala: HMT330 and its like as delivered, in STOP mode. SEND ->
-`RH=  38.3 %RH T=  22.2 'C` (HMT330 user's guide M210566EN, p. 102); it tells no serial number. Neither has a checksum,
-and either may echo what it was asked. Read from guides, not from units.
+`RH=  38.3 %RH T=  22.2 'C` (HMT330 user's guide M210566EN, p. 102); it reports no serial number. Neither has a
+checksum, and either may echo what it was asked. Read from guides, not from units.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ _IDENTITY = re.compile(r"^([^,\r\n]+),([^,\r\n]+),([^,\r\n]+),([^,\r\n]+)\r?\n",
 
 class ProbeSettings(Polled):
     """protocol: which kind answers. baud: as the unit is set, none as delivered. serial_number: refused when the unit
-    tells another one. calibration: of its temperature."""
+    reports another one. calibration: of its temperature."""
 
     protocol: Literal["hart", "vaisala"]
     address: ByteAddress

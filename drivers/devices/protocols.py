@@ -68,7 +68,7 @@ class Controller(Sensor, Actuator, Protocol):
     fault at each `read`, and keeps `set_temperature` and `run` from being obeyed: DeviceFault."""
 
     async def in_force(self) -> InForce:
-        """Return whether the set-point that it has is the one that acts, as it tells now; raises DeviceError."""
+        """Return whether the set-point that it has is the one that acts, as it reports now; raises DeviceError."""
         ...
 
     async def set_temperature(self, degC: float) -> None:

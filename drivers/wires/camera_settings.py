@@ -76,7 +76,7 @@ class AravisCameraSettings(CameraSettings):
     temperature: none looks for the usual features. buffers: frames that the host keeps in reserve. offset_x_px,
     offset_y_px: the first pixel of the region, from which the image's pixels count. binning: so many by so many pixels
     become one, and all sizes count those. exposure_step_s: of one step of ExposureTimeRaw, from its manual, for a
-    camera that tells its exposure no other way.
+    camera that reports its exposure no other way.
     """
 
     pixel_format: PixelFormat = "Mono8"

@@ -98,7 +98,7 @@ class ModbusUnit:
         self.identity = check_same_device(self.name, await self._read_identity(), self.identity)
 
     async def _read_identity(self) -> Identity:
-        """Return what the unit tells of itself; vendor and model are otherwise those of the map."""
+        """Return what the unit reports of itself; vendor and model are otherwise those of the map."""
         stated = {field: await self._identity_field(stated) for field, stated in self.map.identity.items()}
         model = stated.get("model", "")
         return Identity(

@@ -185,7 +185,7 @@ class UnitProof(Document):
 
 
 class IdentityPoint(Document):
-    """A point by which the unit tells what it is, read as a number (scaled) or as hexadecimal digits."""
+    """A point by which the unit reports what it is, read as a number (scaled) or as hexadecimal digits."""
 
     point: str
     shown: Literal["number", "hex"] = "number"
@@ -193,9 +193,9 @@ class IdentityPoint(Document):
 
 class RegisterMap(Document):
     """All that is known about one kind of unit. `fault_bits`: bits that mean trouble, reported as they are.
-    `when_silent`: what to look at when it does not answer. identity: where the unit tells its serial number, model and
-    version; a unit that refuses such a point does not tell it. in_force: of a regulator, what shows that the set-point
-    written is the one that acts; unverified: what of that no register shows."""
+    `when_silent`: what to look at when it does not answer. identity: where the unit reports its serial number, model
+    and version; a unit that refuses such a point does not tell it. in_force: of a regulator, what shows that the
+    set-point written is the one that acts; unverified: what of that no register shows."""
 
     schema_: Literal["regmap/1"] = Field(alias="schema")
     vendor: str

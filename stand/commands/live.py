@@ -174,7 +174,7 @@ def open_view(*, is_virtual: bool = False) -> Generator[View]:
 
 
 class RunFollower:
-    """Shows a run of this process, as its service tells: messages from its hub, from the first on, and how it stands
+    """Shows a run of this process, as its service reports: messages from its hub, from the first on, and how it stands
     from the moment on at which it answers. show, tell: make a View's calls, and keep nobody waiting."""
 
     def __init__(

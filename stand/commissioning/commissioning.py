@@ -121,7 +121,7 @@ class MovementChecks:
         self._add(Finding(name, "travel", "ok", text, data=data))
 
     async def check_axis(self, name: str) -> None:
-        """Home; one that had a home before tells how far it was off, and goes back to where it was."""
+        """Home; one that had a home before reports how far it was off, and goes back to where it was."""
         if name not in self._opened:
             return
         stand, axis = self._assembly.stand, self._assembly.devices.axes[name]

@@ -26,7 +26,7 @@ class DewConfig(Document):
     """The laboratory's air at its wettest. dew_point_degC: of it; or humidity_percent, with the laboratory's
     thermometer. With the flap open no camera and no target may be less than margin_K above it for flap_s: the run is
     held and the flap closes. A plan that captures below a given dew_point_degC is refused. hygrometer: the one of
-    probes that measures that air; what is given counts while it tells nothing.
+    probes that measures that air; what is given counts while it reports nothing.
     """
 
     dew_point_degC: float | None = Field(default=None, ge=-40, le=40)

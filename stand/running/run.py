@@ -160,8 +160,8 @@ class Job:
 class Run:
     """A run on an open stand: it reads, begins its journal, performs its plan and leaves the stand safe.
 
-    answer: tells clients about it from the beginning of its journal on, when it has the stand for itself. course: what
-    may be asked of it, None before that.
+    answer: reports clients about it from the beginning of its journal on, when it has the stand for itself. course:
+    what may be asked of it, None before that.
     """
 
     def __init__(

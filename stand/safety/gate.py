@@ -39,7 +39,7 @@ HELD = event(
     "held",
     "warning",
     "held by {text}",
-    # What the guard says of its rule tells how that ends.
+    # What the guard says of its rule reports how that ends.
     lambda data: (ENDINGS | {INTERLOCK: ""}).get(str(data.get("reason"))) or _STATUS,
     counts=True,
     cases=tuple({"reason": reason} for reason in ENDINGS),

@@ -118,7 +118,7 @@ class ManualControl:
         """Run an order, then read the stage: who waits for its end sees where it is, not where it was when it was
         polled last."""
         await work
-        with suppress(DeviceError):  # the poller tells
+        with suppress(DeviceError):  # the poller reports
             readings = await self._stand.devices.axes[axis].read()
             self._assembly.hub.publish(Batch(axis, self._assembly.clock.now_ns(), readings))
 

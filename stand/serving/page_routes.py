@@ -104,7 +104,7 @@ class PageRoutes:
         self._running: asyncio.Task[None] | None = None
 
     def __call__(self, bridge: Bridge) -> APIRouter:
-        """The routes. The bridge tells which session is under way; what the routes give is no part of its state."""
+        """The routes. The bridge reports which session is under way; what the routes give is no part of its state."""
 
         def session() -> str:
             run = bridge.snapshot.state.run

@@ -207,7 +207,7 @@ class Node:
         return snapshot.state
 
     def _make_line(self, word: str, error_word: str, place: Place, specifier: str = "") -> bytes:
-        """The line that tells a parameter's value, or why there is none."""
+        """The line that reports a parameter's value, or why there is none."""
         (error, content, _), t_s = self._reported[place]
         qualifiers, specifier = {"t": round(t_s, 6)}, specifier or ":".join(place)
         return make_message(

@@ -118,7 +118,7 @@ class Module(NamedTuple):
     drive: Drive | None = None
 
     def describe(self, *, read_only: bool) -> dict[str, object]:
-        """Return what a client is told of it."""
+        """Return what a client gets of it."""
         accessibles: dict[str, object] = {
             name: {"description": each.text, "datainfo": each.info, "readonly": read_only or each.change is None}
             for name, each in self.parameters.items()

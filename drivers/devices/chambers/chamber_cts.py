@@ -85,7 +85,7 @@ class CtsLanguage(ChamberLanguage):
         self._program_reply, self._ramp_reply = settings.program_reply, settings.ramp_reply
         asked = {"P whether a program runs": settings.program_reply, "R1 whether a ramp does": settings.ramp_reply}
         self.in_force_by = ", ".join(
-            ("A0 tells the set-point", *(text for text, is_asked in asked.items() if is_asked))
+            ("A0 reports the set-point", *(text for text, is_asked in asked.items() if is_asked))
         )
         if unasked := [text for text, is_asked in asked.items() if not is_asked]:
             self.not_reported = f"{', '.join(unasked)} (not asked); {self.not_reported}"

@@ -51,7 +51,7 @@ Settings = EspecSettings
 class EspecLanguage(ChamberLanguage):
     """One ESPEC chamber."""
 
-    in_force_by = "TEMP? tells the set-point that acts, MON? whether a program runs"
+    in_force_by = "TEMP? reports the set-point that acts, MON? whether a program runs"
     not_reported = "the unit of temperatures, which the stand compares with its own thermometer"
 
     def __init__(self, name: str, settings: EspecSettings) -> None:

@@ -97,8 +97,8 @@ class JulaboLanguage(ChamberLanguage):
 
     def _say(self) -> None:
         """Log what the queries that this unit answers report, and what the others leave open."""
-        texts = [f"{query} tells {text}" for query, text in _QUERIES.items() if query in self._asked]
-        self.in_force_by = ", ".join((*texts, "status tells whether it is operated by hand"))
+        texts = [f"{query} reports {text}" for query, text in _QUERIES.items() if query in self._asked]
+        self.in_force_by = ", ".join((*texts, "status reports whether it is operated by hand"))
         unknown = [text for query, text in _QUERIES.items() if query not in self._asked]
         self.not_reported = f"{', '.join(unknown)}: compare with its panel" if unknown else ""
 

@@ -76,7 +76,7 @@ Settings = SimservSettings
 class SimservLanguage(ChamberLanguage):
     """One Weiss or Voetsch chamber."""
 
-    in_force_by = "11002 tells the set-point, 10010 whether a program runs, 11066 and 11070 whether a gradient is set"
+    in_force_by = "11002 reports the set-point, 10010 whether a program runs, 11066 and 11070 whether a gradient is set"
     not_reported = "the unit of temperatures, which the stand compares with its own thermometer, and who has the panel"
 
     def __init__(self, name: str, settings: SimservSettings) -> None:

@@ -235,7 +235,7 @@ def _make(name: str, settings: OnBus, around: DriverContext) -> Regulator:
 
 
 def _channels(settings: OnBus, of_section: OfSection, map_of: MapOf) -> tuple[Channel, ...]:
-    """Return what every controller tells, and the outputs that its map has."""
+    """Return what every controller reports, and the outputs that its map has."""
     points = map_of("regulator", settings).points
     return (*CONTROLLED, *(each for each in _OUTPUTS if each.name in points))
 

@@ -16,7 +16,8 @@ from thermostand.stand.serving.api.bridge import Bridge
 @dataclass(frozen=True, slots=True)
 class ProtocolListener:
     """A TCP port at which another protocol is spoken. option: of the command line, which asks for it. serve: given the
-    listening socket in the thread that serves clients, runs until it is cancelled; what should not happen it tells."""
+    listening socket in the thread that serves clients, runs until it is cancelled; what should not happen it
+    reports."""
 
     option: str
     host: str
