@@ -73,7 +73,7 @@ def _is_like_segment(name: str) -> bool:
 
 
 def list_strays(directory: Path) -> tuple[str, ...]:
-    """What lies among the segments or next to their folders, is called as if it were one, and is none: a copy
+    """Return what lies among the segments or next to their folders, is called as if it were one, and is none: a copy
     (`0003 (1).mcap`, `00003.mcap`), what another system leaves (`._0003.mcap`), or no file. It counts for nothing."""
     found: list[str] = []
     for series in ("", TELEMETRY, FRAMES):

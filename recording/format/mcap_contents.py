@@ -177,8 +177,8 @@ def _read_chunk(path: Path, changed_ns: int, begin: int, length: int) -> memoryv
 
 
 def find_rewritten(path: Path) -> McapContents | None:
-    """What is in a segment that another program wrote; None for one of ours, and for what is no MCAP file at all. One
-    of DAMAGE when it is not valid."""
+    """Return what is in a segment that another program wrote; None for one of ours, and for what is no MCAP file at
+    all. One of DAMAGE when it is not valid."""
     with path.open("rb", buffering=0) as file:
         begin = file.read(len(MCAP0_MAGIC) + RECORD.size + 2 * 4 + 256)
         status = path.stat()

@@ -155,7 +155,7 @@ def _make_head(found: McapContents) -> Head:
 
 
 def explain_stranger(found: McapContents) -> str:
-    """What a valid MCAP file is that does not say of which session it is, as the part of a sentence."""
+    """Return what a valid MCAP file is that does not say of which session it is, as the part of a sentence."""
     return (
         f"is a valid MCAP file written by {found.program}, without the record {SESSION_METADATA!r} of a recording; it "
         "counts for nothing and is left alone"

@@ -195,7 +195,7 @@ class ScannedSegment:
 
     @property
     def is_described(self) -> bool:
-        """Its records say which session it is of, and which place it has there."""
+        """Whether its records say which session it is of, and which place it has in that."""
         return bool(self.session and self.place)
 
 
@@ -235,7 +235,7 @@ class Scan:
 
     @property
     def is_sound(self) -> bool:
-        """Nothing is damaged or missing, or of another version."""
+        """Whether nothing is damaged or missing, or of another version."""
         return self.files is Files.SOUND
 
     def sentences(self, files: Files) -> tuple[str, ...]:
@@ -286,7 +286,7 @@ def summarise_findings(findings: Iterable[SessionFinding]) -> list[str]:
 
 
 def _no_report(share: float, text: str) -> None:
-    """No progress is shown."""
+    """Show no progress."""
 
 
 def verify(path: Path, report: Report = _no_report) -> Scan:
@@ -693,7 +693,7 @@ class _SessionScanner:
             yield _make_missing(f"is missing: {MANIFEST_NAME} lists {_format_segments(len(unseen))} more", where)
 
     def _find_lost_end(self) -> _LostEnd | None:
-        """Whether the end of the telemetry is missing; None while something of it is unread, or damaged."""
+        """Return whether the end of the telemetry is missing; None while something of it is unread, or damaged."""
         series = [file for file in self._files if file.series == TELEMETRY]
         seen = [each for each in self._select_series(TELEMETRY) if each.messages]
         if not seen or self._is_recording or series[-1].state is SegmentState.UNFINISHED:
@@ -733,11 +733,11 @@ class _SessionScanner:
         return last if isinstance(last, int) else None
 
     def frames_short(self) -> bool:
-        """Whether there are fewer frames than planned."""
+        """Return whether there are fewer frames than planned."""
         return bool(format_planned_frames(self._find_planned_count(), self._count_frames()))
 
     def _all_frames_are_read(self) -> bool:
-        """Whether no frame may be in a segment that was not read."""
+        """Return whether no frame may be in a segment that was not read."""
         unread = (SegmentState.UNFINISHED, SegmentState.RECORDING)
         return not any(file.series == FRAMES and file.state in unread for file in self._files)
 
@@ -815,7 +815,7 @@ class _SessionScanner:
         yield from loose
 
     def _has_camera_degC(self) -> bool | None:
-        """Whether the camera states its temperature, by the descriptions up to the first that has one.
+        """Return whether the camera states its temperature, by the descriptions up to the first that has one.
 
         None without any description.
         """
@@ -854,7 +854,7 @@ class _SessionScanner:
 
 
 def _is_utf_8(text: str) -> bool:
-    """Whether an attached text was; other bytes stand in it as surrogates."""
+    """Return whether an attached text was; other bytes stand in it as surrogates."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -961,7 +961,7 @@ def format_planned_frames(planned: int | None, frames: int) -> str:
 
 
 def has_run(events: Iterable[Event], marks: Iterable[StepMark]) -> bool:
-    """Whether a run was recorded whose journal was begun: its first step comes after that."""
+    """Return whether a run was recorded whose journal was begun: its first step comes after that."""
     return any(event.kind in RUN_BEGINS for event in events) and any(True for _ in marks)
 
 
@@ -997,9 +997,10 @@ def _explain_lost_end(
 
 
 def _is_recovered(kept: SegmentFile, salvaged: ScannedSegment | None, is_first: bool) -> bool:
-    """Whether the repaired segment has every message of the original: as many as its recorder had listed (of the first
-    repair that kept one: what was listed later had been repaired), or its repair lost no byte, and both have as many.
-    The original must then reach the end of its data; of one that was cut short the number of messages is unknown."""
+    """Return whether the repaired segment has every message of the original: as many as its recorder had listed (of the
+    first repair that kept one: what was listed later had been repaired), or its repair lost no byte, and both have as
+    many. The original must then reach the end of its data; of one that was cut short the number of messages is unknown.
+    """
     if salvaged is None:
         return False
     if is_first and salvaged.salvage.get("listed") == str(salvaged.messages):
@@ -1016,7 +1017,7 @@ def _is_recovered(kept: SegmentFile, salvaged: ScannedSegment | None, is_first: 
 
 
 def _check_journal(path: Path, stated: Manifest, journal: JournalFacts | None) -> Iterator[SessionFinding]:
-    """Whether the journal has the lines that it had when the recording ended."""
+    """Return whether the journal has the lines that it had when the recording ended."""
     due = stated.journal
     if due is None or (journal is not None and journal.damage):
         return  # damaged lines are a finding already

@@ -144,8 +144,8 @@ class RewrittenAs(NamedTuple):
 
 
 def judge_rewritten(found: McapContents, known: Sealed | None) -> RewrittenAs:
-    """Whether a segment that another program has written still holds what was recorded, by what `session.json` lists of
-    it (None: nothing)."""
+    """Return whether a segment that another program has written still holds what was recorded, by what `session.json`
+    lists of it (None: nothing)."""
     by = f"was rewritten by {found.program}"
     if known is None or not known.content:
         return RewrittenAs(Files.SOUND, f"{by}; whether it holds all that was recorded is not known")

@@ -369,7 +369,7 @@ class Session:
         return self.scanned.run
 
     def is_rewritten(self, segment: Path) -> bool:
-        """Whether another program has written a segment of the session."""
+        """Return whether another program has written a segment of the session."""
         with suppress(SessionError):
             return segment in self.segments and self._check(segment).rewritten is not None
         return False

@@ -86,7 +86,7 @@ class SegmentOpening:
     channels: Mapping[int, Channel]
 
     def knows(self, channel: int) -> bool:
-        """Whether messages of that channel can be delivered."""
+        """Return whether messages of that channel can be delivered."""
         return channel in self.channels and self.channels[channel].schema_id in self.schemas
 
 
@@ -149,7 +149,7 @@ def _get_identity(session: Mapping[str, str]) -> tuple[str, str]:
 
 
 def _is_same_session(one: SegmentScan, other: SegmentScan) -> bool:
-    """Whether nothing that is known of both says that they are of different sessions."""
+    """Return whether nothing that is known of both says that they are of different sessions."""
     if one.session and other.session and _get_identity(one.session) != _get_identity(other.session):
         return False
     both = one.attachments.keys() & other.attachments.keys()
@@ -188,11 +188,11 @@ ReportShare = Callable[[float, str], None]
 
 
 def no_report(share: float, text: str) -> None:
-    """No progress is shown."""
+    """Show no progress."""
 
 
 class ShareProgress:
-    """Of `paths`; each is read from its begin to its end, perhaps more than once."""
+    """The progress over `paths`; each is read from its begin to its end, perhaps more than once."""
 
     def __init__(self, paths: Iterable[Path], report: ReportShare) -> None:
         self._sizes = {path: _get_size(path) for path in paths}
@@ -201,7 +201,7 @@ class ShareProgress:
         self._done = 0
 
     def within(self, path: Path) -> Callable[[int], None]:
-        """To be called with how many bytes of `path` have been read."""
+        """Return what is to be called with how many bytes of `path` have been read."""
         return lambda read_bytes: self._report(min(1.0, (self._done + read_bytes) / self._total), path.name)
 
     def finished(self, path: Path) -> None:
@@ -320,7 +320,7 @@ def _leave_rewritten(path: Path, found: McapContents) -> Salvaged:
 
 
 def _find_listed(path: Path) -> Sealed | None:
-    """What `session.json` lists of a finished segment."""
+    """Return what `session.json` lists of a finished segment."""
     stated = read_manifest(path.parent.parent)
     return stated.segments.get(f"{path.parent.name}/{path.name}") if isinstance(stated, Manifest) else None
 
@@ -555,7 +555,7 @@ def _write_opening(writer: McapWriter, table: FrameTable, original: _Original) -
 
 
 def _make_salvage_metadata(original: _Original) -> dict[str, str]:
-    """What the record `repair` says. listed: how many messages its recorder listed of the segment."""
+    """Return what the record `repair` says. listed: how many messages its recorder listed of the segment."""
     known = _find_listed(original.finished)
     listed = {} if known is None else {"listed": str(sum(known.messages.values()))}
     return {

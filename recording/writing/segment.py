@@ -159,7 +159,7 @@ class CommitSink:
         self.committed_bytes = end_bytes
 
     def seal(self, digest: ContentDigest) -> Sealed:
-        """What has been committed, as a whole file with these messages."""
+        """Return what has been committed, as a whole file with these messages."""
         return Sealed(self.committed_bytes, self._sha256.hexdigest(), dict(digest.counts), digest.hexdigest())
 
     def settle(self) -> None:
@@ -333,7 +333,7 @@ class Segment:
 
 
 def _compute_affordable_bytes(folder: Path, form: SeriesSpec) -> int:
-    """What a segment may reserve here and now."""
+    """Return what a segment may reserve here and now."""
     if not form.reserve_bytes:
         return 0
     spare_bytes = read_disk_space(folder).free_bytes - max(form.keep_free_bytes, FILE_SYSTEM_BYTES)

@@ -195,7 +195,8 @@ def _extract_ramp(pv: NDArray[np.float64], camera: NDArray[np.float64], to_degC:
 
 
 def _measure_above_air_K(camera: NDArray[np.float64], pv: NDArray[np.float64]) -> float:
-    """How much warmer than the air the camera is in the last minute; NaN when its temperature is not there then."""
+    """Return how much warmer than the air the camera is in the last minute; NaN when its temperature is not there
+    then."""
     end_s = float(pv[0, -1])
     last = [values[1, values[0] >= end_s - _CAMERA_MEAN_S] for values in (camera, pv)]
     return float(last[0].mean() - last[1].mean()) if all(values.size for values in last) else math.nan

@@ -32,7 +32,7 @@ class Turn:
 
 
 def preview_order(order: Order, directory: Path, turn: Turn, lacks: Sequence[str]) -> RunPreview:
-    """What the order would do; its session would lie in `directory`. ConfigError as estimate_plan."""
+    """Return what the order would do; its session would lie in `directory`. ConfigError as estimate_plan."""
     config, plan = order.config, tuple(order.recipe.plan())
     estimate, learned = estimate_plan(plan, config, directory), load_learned_durations(directory)
     begins_s = [0.0, *accumulate(step.duration_s for step in estimate.steps)]

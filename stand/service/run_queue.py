@@ -32,7 +32,7 @@ from thermostand.stand.service.queue_file import Queue, QueueEntry, QueueState, 
 from thermostand.stand.service.queue_worker import is_complete
 from thermostand.stand.service.run_preview import Turn, preview_order
 from thermostand.stand.serving.alerts import missing_command
-from thermostand.stand.serving.api_models import Conflict, Missing, QueuedRun, RunPreview, RunRequest, Who
+from thermostand.stand.serving.api_models import Conflict, Missing, QueuedRun, Requester, RunPreview, RunRequest
 
 _SHOWN = 50  # runs that have ended
 
@@ -90,7 +90,7 @@ class RunQueue:
         await self.disk.call(queue.reset, self.directory)
         await self.read()
 
-    async def submit(self, who: Who, request: RunRequest, key: str) -> QueueEntry:
+    async def submit(self, who: Requester, request: RunRequest, key: str) -> QueueEntry:
         """ConfigError for what is wrong with the request, Conflict for what is wrong with the stand."""
         order = await self.reading.call(self._load_order, request)
         make_note(who, request.note, request.tags)
@@ -109,14 +109,14 @@ class RunQueue:
         return entry
 
     async def preview(self, request: RunRequest, run_end_ns: int | None) -> RunPreview:
-        """What the request would do if it were queued now; ConfigError for what is wrong with it. run_end_ns: when the
-        run under way is expected to end, None without one or when that is not known."""
+        """Return what the request would do if it were queued now; ConfigError for what is wrong with it. run_end_ns:
+        when the run under way is expected to end, None without one or when that is not known."""
         order = await self.reading.call(self._load_order, request)
         turn, lacks = self._find_turn(run_end_ns), self._list_lacks(order)
         return await self.reading.call(preview_order, order, self.directory, turn, lacks)
 
     def _find_turn(self, run_end_ns: int | None) -> Turn:
-        """When a run that is queued now has its turn."""
+        """Return when a run that is queued now has its turn."""
         entries = self.queued.entries
         is_running = any(entry.state is QueueState.RUNNING for entry in entries)
         before = [entry for entry in entries if entry.is_open]
@@ -228,7 +228,7 @@ class RunQueue:
         return order.recipe.name
 
     def get_order(self, entry: QueueEntry) -> Order:
-        """What it asks for, on the stand as it is open now; ConfigError as `queue.order_of`."""
+        """Return what it asks for, on the stand as it is open now; ConfigError as `queue.order_of`."""
         return self._adapt_to_stand(replace(queue.make_order(entry), attended=entry.attended))
 
     def _adapt_to_stand(self, order: Order) -> Order:
@@ -251,7 +251,8 @@ class RunQueue:
         return folder
 
     def _load_recorded_order(self, session: str) -> Order:
-        """What a session was to run; Missing when there is no such session, Conflict when it cannot be resumed."""
+        """Return what a session was to run; Missing when there is no such session, Conflict when it cannot be
+        resumed."""
         folder = self.find_session(session)
         try:
             texts = dict(Session.open(folder).attachments)
@@ -260,7 +261,7 @@ class RunQueue:
             raise Conflict(str(error)) from error
 
     def _estimate(self, order: Order) -> PlanEstimate:
-        """What the run will take; Conflict when the disk has no space for it."""
+        """Return what the run will take; Conflict when the disk has no space for it."""
         estimate = estimate_plan(tuple(order.recipe.plan()), order.config, self.directory)
         if lack := explain_small_disk(self.directory, estimate.steps, order.config):
             raise Conflict(f"{self.directory}: {lack}")
@@ -271,7 +272,7 @@ class RunQueue:
             raise Conflict(f"this stand cannot run it now: {'; '.join(lacks)}")
 
     def _list_lacks(self, order: Order) -> list[str]:
-        """What does not answer now, and what else would end the run at its beginning."""
+        """Return what does not answer now, and what else would end the run at its beginning."""
         assembly = self._open_stand.assembly
         lacks = [
             f"{channel} is not read: {reading.reason}"
@@ -287,6 +288,6 @@ class RunQueue:
         return lacks
 
 
-def make_note(who: Who, note: str, tags: Sequence[str]) -> OperatorNote | None:
+def make_note(who: Requester, note: str, tags: Sequence[str]) -> OperatorNote | None:
     """A note and tags, None without either; ConfigError for what is no tag."""
     return OperatorNote(who, note, tags) if note.strip() or tags else None

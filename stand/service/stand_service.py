@@ -17,9 +17,9 @@ from thermostand.recording.reading.notes import LONGEST_NOTE
 from thermostand.stand.safety.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
 from thermostand.stand.serving.api_models import (
     LONGEST_RECIPE,
+    CommandAnswer,
     Conflict,
     DeviceState,
-    Done,
     FaultRequest,
     FaultState,
     Missing,
@@ -27,6 +27,7 @@ from thermostand.stand.serving.api_models import (
     PlanRequest,
     PlanStep,
     QueuedRun,
+    Requester,
     RunPreview,
     RunRequest,
     RunStatus,
@@ -34,7 +35,6 @@ from thermostand.stand.serving.api_models import (
     StandState,
     Tag,
     When,
-    Who,
     WrittenStep,
     snapshot_state,
 )
@@ -173,7 +173,7 @@ class StandService(Served):
         changes = host.get_state_fields()
         if run is not None:
             changes.update(run.get_state_fields())
-        elif host.guest is not None:
+        elif host.active_run is not None:
             changes["phase"] = "stopping" if host.is_leaving else "running"
         latch = self._open_stand.latch
         if (fault := latch.fault) is not None:
@@ -189,7 +189,7 @@ class StandService(Served):
         return self._require_run().check_edit(from_index, steps)
 
     async def preview(self, request: RunRequest) -> RunPreview:
-        """What a recipe would do here now: see RunPreview."""
+        """Return what a recipe would do here now: see RunPreview."""
         run = self._run
         run_end_ns = None if run is None else cast("RunStatus", run.get_state_fields()["run"]).end_ns
         return await self._require_queue().preview(request, run_end_ns)
@@ -204,24 +204,24 @@ class StandService(Served):
 
         return await list_simulated_faults(self._assembly)
 
-    def make_answer(self, verb: str, text: str) -> Done:
+    def make_answer(self, verb: str, text: str) -> CommandAnswer:
         """Make an answer with what holds the run now, and what is still under way."""
         stand = self._assembly.stand
         reasons, moving = tuple(sorted(stand.gate.reasons)), tuple(stand.motions.texts)
-        return Done(verb=verb, text=text, reasons=reasons, moving=moving)
+        return CommandAnswer(verb=verb, text=text, reasons=reasons, moving=moving)
 
     @command("/run/stop", anywhere=True)
-    def stop(self, who: Who) -> str:
+    def stop(self, who: Requester) -> str:
         """Make the stand safe and end the run, as Ctrl-C does. Needs no token and no body, in every state, as often as
         you like.
 
         Example: stand stop
         """
         self.host.stop()
-        return "the stand is made safe" + ("" if self.host.guest is None else ", and the run ends")
+        return "the stand is made safe" + ("" if self.host.active_run is None else ", and the run ends")
 
     @command("/run/pause")
-    def pause(self, who: Who, given: PauseRequest) -> str:
+    def pause(self, who: Requester, given: PauseRequest) -> str:
         """Hold the run before its next action; soak time so far is kept, and the chamber holds its set-point.
 
         Moves under way are completed, and the answer lists them; `stand stop` stops it. The flap is shut within a
@@ -236,16 +236,16 @@ class StandService(Served):
         return describe_pause(given.when)
 
     @command("/run/continue")
-    def continue_(self, who: Who) -> str:
+    def continue_(self, who: Requester) -> str:
         """End a pause, or the pause of a prompt.
 
         Example: stand continue sessions/20260101T180000Z-thermal-cycle
         """
-        self._require_run().go_on()
+        self._require_run().end_pause()
         return describe_hold(self._assembly.stand.gate.reasons)
 
     @command("/run/reset", verbs=())
-    def reset(self, who: Who) -> str:
+    def reset(self, who: Requester) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
         host, orders = self.host, self.host.orders
         if self._open_stand.latch.fault is None and (orders is None or not orders.queued.halted):
@@ -257,7 +257,7 @@ class StandService(Served):
         return f"reset; {still}" if still else "reset"
 
     @command("/run/skip")
-    async def skip(self, who: Who, given: SkipRequest) -> str:
+    async def skip(self, who: Requester, given: SkipRequest) -> str:
         """Leave a step out, or break it off. Durable when it is answered.
 
         Frames after a soak that was left out are flagged `unsettled`, and a fit leaves them out.
@@ -269,7 +269,7 @@ class StandService(Served):
         return f"step {given.step_id} is left out"
 
     @command("/run/extend")
-    async def extend(self, who: Who, given: ExtendRequest) -> str:
+    async def extend(self, who: Requester, given: ExtendRequest) -> str:
         """Soak for longer in a step. Durable when it is answered.
 
         Example: stand extend 12 30
@@ -279,13 +279,13 @@ class StandService(Served):
         return f"step {given.step_id} takes {given.by_s / 60.0:g} min longer"
 
     @command("/run/plan", http="PUT", verbs=())
-    async def edit(self, who: Who, given: PlanRequest) -> str:
+    async def edit(self, who: Requester, given: PlanRequest) -> str:
         """Replace the steps from a place on, none of which was begun. Durable when it is answered."""
         count = await self._require_run().edit(given.from_index, given.steps)
         return f"the steps from number {given.from_index + 1} on are replaced by {count} others"
 
     @command("/queue", status=201, verbs=("submit", "queue add"), by_secop="recipe")
-    async def submit(self, who: Who, given: SubmitRequest) -> QueuedRun:
+    async def submit(self, who: Requester, given: SubmitRequest) -> QueuedRun:
         """Check a run and queue it as it is now. Later edits of its file change nothing.
 
         Recipe, limits, wires and the space on the disk are checked. With the key of an earlier run: that one, 409 when
@@ -299,26 +299,26 @@ class StandService(Served):
         return orders.describe_run(entry)
 
     @command("/recipes/{recipe}", http="PUT", verbs=(), by_secop=None, title="Save as a recipe")
-    async def save_recipe(self, who: Who, given: SaveRequest) -> str:
+    async def save_recipe(self, who: Requester, given: SaveRequest) -> str:
         """Save a recipe of your own beside the sessions, in the place of one of that name; installed ones stay."""
         await self._require_queue().save_recipe(given.recipe, given.recipe_text)
         return f"saved as {given.recipe}"
 
     @command("/recipes/{recipe}", http="DELETE", verbs=(), by_secop=None, title="Remove this recipe")
-    async def remove_recipe(self, who: Who, given: RecipeRequest) -> str:
+    async def remove_recipe(self, who: Requester, given: RecipeRequest) -> str:
         """Remove a recipe of your own; runs that were queued with it stay as they are."""
         await self._require_queue().remove_recipe(given.recipe)
         return f"the recipe {given.recipe} is removed"
 
     @command("/recipes/rehearse", verbs=(), by_secop=None)
-    async def rehearse(self, who: Who, given: RunRequest) -> str:
+    async def rehearse(self, who: Requester, given: RunRequest) -> str:
         """Run a recipe in virtual time, in a simulated laboratory. Nothing of this stand moves; the session is in the
         list, marked as simulated, when it is done."""
         name = await self._require_queue().rehearse_order(given)
         return f"{name} is rehearsed in virtual time; its session comes into the list, marked as simulated"
 
     @command("/queue/{run}", http="DELETE", verbs=("queue remove",), title="Remove")
-    async def cancel(self, who: Who, given: CancelRequest) -> str:
+    async def cancel(self, who: Requester, given: CancelRequest) -> str:
         """Take a run out of the queue; what it has recorded stays.
 
         Example: stand queue remove 5
@@ -328,7 +328,7 @@ class StandService(Served):
         return f"run {given.run} is out of the queue"
 
     @command("/queue/{run}/move", verbs=("queue move",))
-    async def move(self, who: Who, given: MoveRequest) -> str:
+    async def move(self, who: Requester, given: MoveRequest) -> str:
         """Change when a run has its turn.
 
         Example: stand queue move 5 1
@@ -337,7 +337,7 @@ class StandService(Served):
         return f"run {given.run} has turn {given.to}"
 
     @command("/sessions/{session}/resume", verbs=())
-    async def resume(self, who: Who, given: ResumeRequest) -> str:
+    async def resume(self, who: Requester, given: ResumeRequest) -> str:
         """Resume an interrupted run in its session; it is the next one."""
         orders = self._require_queue()
         if self._open_stand.latch.fault is not None:
@@ -347,13 +347,13 @@ class StandService(Served):
         return f"run {entry.id} is resumed next"
 
     @command("/devices/{device}/{verb}", verbs=())
-    async def device(self, who: Who, given: DeviceRequest) -> str:
+    async def device(self, who: Requester, given: DeviceRequest) -> str:
         """Tell a device something between runs, through the same gate as a run. What takes longer than a moment goes on
         when this is answered, and its failure is an event."""
         return await self.host.run_manual_order(given.device, given.verb, given.arguments)
 
     @command("/sessions/{session}/notes", verbs=(), by_secop=None)
-    async def note(self, who: Who, given: NoteRequest) -> str:
+    async def note(self, who: Requester, given: NoteRequest) -> str:
         """Add a note and tags to a session, running or finished."""
         from thermostand.stand.running.run_control import OperatorNote, save_note
 
@@ -362,7 +362,7 @@ class StandService(Served):
         return "noted"
 
     @command("/simulator/faults", verbs=(), by_secop=None)
-    async def fault(self, who: Who, given: FaultRequest) -> str:
+    async def fault(self, who: Requester, given: FaultRequest) -> str:
         """Break something of the simulated laboratory on purpose, or mend it; 409 for a real stand."""
         from thermostand.stand.running.simulated_faults import break_or_mend
 
@@ -381,8 +381,8 @@ class StandService(Served):
     @property
     def _run(self) -> RunControl | None:
         """The control of the run that has the stand, once it can be asked anything."""
-        guest = self.host.guest
-        return None if guest is None else guest.course
+        active_run = self.host.active_run
+        return None if active_run is None else active_run.course
 
     def _require_run(self) -> RunControl:
         run = self._run

@@ -27,15 +27,15 @@ from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import COMMAND
 from thermostand.foundation.hub import Hub
 from thermostand.stand.serving.api_models import (
+    CommandAnswer,
     DeviceState,
-    Done,
     PlanCheck,
     PlanStep,
+    Requester,
     RunPreview,
     RunRequest,
     SimulatedFaults,
     StandState,
-    Who,
     WrittenStep,
 )
 
@@ -143,7 +143,7 @@ def collect_commands(service: type[Served]) -> dict[str, Command]:
 def _make_command(method_name: str, method: Callable[..., object], mark: _Mark) -> Command:
     hints = get_type_hints(method)
     answer = hints.pop("return")
-    argument = [hint for hint in hints.values() if hint is not Who]
+    argument = [hint for hint in hints.values() if hint is not Requester]
     name = method_name.rstrip("_")
     title, verbs = mark.title or name.replace("_", " ").capitalize(), (name,) if mark.verbs is None else mark.verbs
     return Command(
@@ -152,7 +152,7 @@ def _make_command(method_name: str, method: Callable[..., object], mark: _Mark) 
         method=method_name,
         text=inspect.getdoc(method) or "",
         argument=cast("type[Document]", argument[0]) if argument else None,
-        answer=Done if answer is str else cast("type[BaseModel]", answer),
+        answer=CommandAnswer if answer is str else cast("type[BaseModel]", answer),
     )
 
 
@@ -181,7 +181,7 @@ class Served(ABC):
 
     @abstractmethod
     async def preview(self, request: RunRequest) -> RunPreview:
-        """What a recipe would do on this stand now; queues nothing. Conflict where no queue is kept."""
+        """Return what a recipe would do on this stand now; queues nothing. Conflict where no queue is kept."""
 
     @abstractmethod
     def devices(self) -> tuple[DeviceState, ...]:
@@ -192,10 +192,10 @@ class Served(ABC):
         """Return what can be broken on purpose; Conflict when the stand is no simulated one."""
 
     @abstractmethod
-    def make_answer(self, verb: str, text: str) -> Done:
+    def make_answer(self, verb: str, text: str) -> CommandAnswer:
         """The answer to a command of which that sentence came."""
 
-    def perform(self, name: str, who: Who, given: Document | None = None) -> BaseModel | Awaitable[BaseModel]:
+    def perform(self, name: str, who: Requester, given: Document | None = None) -> BaseModel | Awaitable[BaseModel]:
         """Do a command, and record who asked for it and what came of it; raises what it raises. One that awaits
         nothing, as STOP, is done when this returns."""
         found = self.commands[name]
@@ -208,7 +208,7 @@ class Served(ABC):
             return self._complete(who, name, given, came)
         return self._record_result(who, name, given, came)
 
-    async def _complete(self, who: Who, name: str, given: Document | None, work: Awaitable[Any]) -> BaseModel:
+    async def _complete(self, who: Requester, name: str, given: Document | None, work: Awaitable[Any]) -> BaseModel:
         try:
             came = await work
         except StandError as error:
@@ -216,11 +216,11 @@ class Served(ABC):
             raise
         return self._record_result(who, name, given, came)
 
-    def _record_result(self, who: Who, name: str, given: Document | None, came: object) -> BaseModel:
+    def _record_result(self, who: Requester, name: str, given: Document | None, came: object) -> BaseModel:
         self.publish_command(who, name, given)
         return self.make_answer(name, came) if isinstance(came, str) else cast("BaseModel", came)
 
-    def publish_command(self, who: Who, name: str, given: Document | None, result: str = "done") -> None:
+    def publish_command(self, who: Requester, name: str, given: Document | None, result: str = "done") -> None:
         """The event of a command: who, how, what, and what came of it."""
         arguments = summarize_argument(given)
         data = {"who": who.name, "how": who.how, "verb": name, "arguments": arguments, "result": result}

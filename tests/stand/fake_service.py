@@ -45,9 +45,9 @@ from thermostand.stand.service.stand_service import (
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api.server import serve
 from thermostand.stand.serving.api_models import (
+    CommandAnswer,
     Conflict,
     DeviceState,
-    Done,
     FaultRequest,
     FaultState,
     HeatByHand,
@@ -59,12 +59,12 @@ from thermostand.stand.serving.api_models import (
     PlanStep,
     QueuedRun,
     ReadingState,
+    Requester,
     RunPreview,
     RunRequest,
     RunStatus,
     SimulatedFaults,
     StandState,
-    Who,
     WrittenStep,
 )
 from thermostand.stand.serving.commands import Served, summarize_argument
@@ -105,7 +105,7 @@ class FakeService(StandService):
         self.tripped: FaultState | None = None
         self.not_confirmed: tuple[NotConfirmed, ...] = ()
         self.moving: tuple[str, ...] = ()
-        self.orders: list[tuple[Who, str, dict[str, JsonValue]]] = []
+        self.orders: list[tuple[Requester, str, dict[str, JsonValue]]] = []
         self.queue: list[QueuedRun] = []
         self.is_simulated = True
         self.edited: tuple[WrittenStep, ...] = ()
@@ -177,61 +177,61 @@ class FakeService(StandService):
     def _parse(self, text: str) -> dict[str, Any]:
         return {"recipe_text": text, "recipe": parse_document(text, Recipe, "the recipe")}
 
-    async def save_recipe(self, who: Who, given: SaveRequest) -> str:
+    async def save_recipe(self, who: Requester, given: SaveRequest) -> str:
         save_recipe(str(self.sessions), given.recipe, given.recipe_text)
         return f"saved as {given.recipe}"
 
-    async def remove_recipe(self, who: Who, given: RecipeRequest) -> str:
+    async def remove_recipe(self, who: Requester, given: RecipeRequest) -> str:
         remove_recipe(str(self.sessions), given.recipe)
         return f"the recipe {given.recipe} is removed"
 
-    async def rehearse(self, who: Who, given: RunRequest) -> str:
+    async def rehearse(self, who: Requester, given: RunRequest) -> str:
         self.rehearsed = (await self.preview(given)).recipe
         return "rehearsed"
 
     def devices(self) -> tuple[DeviceState, ...]:
         return (DeviceState(name="flap", kind="flap"),)
 
-    def make_answer(self, verb: str, text: str) -> Done:
-        return Done(verb=verb, text=text, reasons=tuple(sorted(self.gate.reasons)), moving=self.moving)
+    def make_answer(self, verb: str, text: str) -> CommandAnswer:
+        return CommandAnswer(verb=verb, text=text, reasons=tuple(sorted(self.gate.reasons)), moving=self.moving)
 
-    def publish_command(self, who: Who, name: str, given: Document | None, result: str = "done") -> None:
+    def publish_command(self, who: Requester, name: str, given: Document | None, result: str = "done") -> None:
         super().publish_command(who, name, given, result)
         if result == "done":
             self.orders.append((who, name, summarize_argument(given)))
 
-    def pause(self, who: Who, given: PauseRequest) -> str:
+    def pause(self, who: Requester, given: PauseRequest) -> str:
         self.gate.hold(OPERATOR)
         return describe_pause(given.when)
 
-    def continue_(self, who: Who) -> str:
+    def continue_(self, who: Requester) -> str:
         self.gate.clear(OPERATOR)
         return describe_hold(self.gate.reasons)
 
-    def reset(self, who: Who) -> str:
+    def reset(self, who: Requester) -> str:
         if INTERLOCK not in self.gate.reasons:
             raise Conflict("there is nothing to reset: no interlock holds this run")
         self.gate.clear(INTERLOCK)
         return ""
 
-    def stop(self, who: Who) -> str:
+    def stop(self, who: Requester) -> str:
         return ""
 
-    async def skip(self, who: Who, given: SkipRequest) -> str:
+    async def skip(self, who: Requester, given: SkipRequest) -> str:
         if given.step_id not in ("0-soak", "1"):
             raise Missing("the plan has no such step")
         return f"step {given.step_id} is left out"
 
-    async def extend(self, who: Who, given: ExtendRequest) -> str:
+    async def extend(self, who: Requester, given: ExtendRequest) -> str:
         if given.step_id not in ("0-soak", "1"):
             raise Missing("the plan has no such step")
         return f"step {given.step_id} takes {given.by_s / 60:g} min longer"
 
-    async def edit(self, who: Who, given: PlanRequest) -> str:
+    async def edit(self, who: Requester, given: PlanRequest) -> str:
         self.edited = given.steps
         return ""
 
-    async def submit(self, who: Who, given: SubmitRequest) -> QueuedRun:
+    async def submit(self, who: Requester, given: SubmitRequest) -> QueuedRun:
         key, order = given.key, RunRequest.model_validate(given.model_dump(exclude={"key"}))
         if key and key in self.requests:
             before, run = self.requests[key]
@@ -244,30 +244,30 @@ class FakeService(StandService):
         self.requests[key] = order, run
         return run
 
-    async def cancel(self, who: Who, given: CancelRequest) -> str:
+    async def cancel(self, who: Requester, given: CancelRequest) -> str:
         self._check_run(given.run)
         self.queue = [each for each in self.queue if each.id != given.run]
         return ""
 
-    async def move(self, who: Who, given: MoveRequest) -> str:
+    async def move(self, who: Requester, given: MoveRequest) -> str:
         self._check_run(given.run)
         return ""
 
-    async def resume(self, who: Who, given: ResumeRequest) -> str:
+    async def resume(self, who: Requester, given: ResumeRequest) -> str:
         raise Conflict("a run has the stand")
 
-    async def device(self, who: Who, given: DeviceRequest) -> str:
+    async def device(self, who: Requester, given: DeviceRequest) -> str:
         if given.device != "flap":
             raise Missing("there is no such device")
         return ""
 
-    async def note(self, who: Who, given: NoteRequest) -> str:
+    async def note(self, who: Requester, given: NoteRequest) -> str:
         return ""
 
     async def list_simulated_faults(self) -> SimulatedFaults:
         return SimulatedFaults(faults=KNOWN_FAULTS, standing=dict(self.standing))
 
-    async def fault(self, who: Who, given: FaultRequest) -> str:
+    async def fault(self, who: Requester, given: FaultRequest) -> str:
         if given.name not in {each.name for each in KNOWN_FAULTS}:
             raise Missing(f"there is no fault {given.name}")
         if given.mend:

@@ -6,7 +6,7 @@ import pytest
 
 from tests.system.test_daemon import BRIEF, is_idle, serve
 from thermostand.foundation.errors import SessionError
-from thermostand.recording.reading.catalogue import look_at
+from thermostand.recording.reading.catalogue import inspect_session
 
 __all__ = ["serve"]
 
@@ -31,7 +31,7 @@ def test_a_design_is_previewed_saved_rehearsed_and_removed(serve):
     served.post("recipes/rehearse", recipe="brief")
     served.until(lambda _: _find_event(served, "rehearsed") is not None)
     session = _find_event(served, "rehearsed")["data"]["session"]
-    assert look_at(served.out / session).simulated
+    assert inspect_session(served.out / session).simulated
     assert served.state().queue == ()  # a rehearsal is no run of the stand
 
     served.server.request("DELETE", "/api/v1/recipes/brief", None, 20.0)

@@ -30,10 +30,10 @@ from thermostand.stand.serving.api_models import (
     PlanCheck,
     PlanRequest,
     QueuedRun,
+    Requester,
     RunPreview,
     RunRequest,
     SimulatedFaults,
-    Who,
 )
 from thermostand.stand.serving.commands import STOP, Command
 
@@ -72,7 +72,7 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
 
     @router.get("/commands", response_model=list[CommandInfo])
     async def known() -> Response:
-        """What may be ordered, and how."""
+        """List what may be ordered, and how."""
         return _make_list_response(
             CommandInfo(
                 name=each.name,
@@ -88,7 +88,7 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
     # Asked of the stand by the page: rules written again in JavaScript would differ from those that count.
     @router.post("/run/plan/check", response_model=PlanCheck)
     async def check_edit(body: PlanRequest) -> Response:
-        """What replacing these steps would say, step by step; changes nothing."""
+        """Return what replacing these steps would say, step by step; changes nothing."""
         return _make_response(await bridge.check_edit(body.from_index, body.steps))
 
     @router.post("/recipes/preview", response_model=RunPreview)
@@ -98,17 +98,17 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
 
     @router.get("/queue", response_model=list[QueuedRun])
     async def queue() -> Response:
-        """What has ended, the run under way, and those to be done in their order."""
+        """Return what has ended, the run under way, and those to be done in their order."""
         return _make_list_response(bridge.snapshot.state.queue)
 
     @router.get("/devices", response_model=list[DeviceState])
     async def devices() -> Response:
-        """What there is, and which commands it takes by hand between runs."""
+        """List the devices, and which commands each takes by hand between runs."""
         return _make_list_response(await bridge.ask(lambda service: service.devices()))
 
     @router.get("/simulator/faults", response_model=SimulatedFaults)
     async def faults() -> Response:
-        """What can be broken in the simulated laboratory, and what is; 409 for a real stand."""
+        """List what can be broken in the simulated laboratory, and what is; 409 for a real stand."""
         return _make_response(await bridge.ask(lambda service: service.list_simulated_faults()))
 
     return router

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from thermostand.foundation.documents import parse_yaml
 from thermostand.foundation.errors import NotFound, SessionError
 from thermostand.recording.format.inventory import list_segments
-from thermostand.recording.reading.catalogue import ListedSession, SessionCache, load_catalogue, look_at
+from thermostand.recording.reading.catalogue import ListedSession, SessionCache, inspect_session, load_catalogue
 from thermostand.stand.config.own_recipes import NamedRecipe, list_recipes, read_recipe
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
@@ -123,7 +123,7 @@ def make_session_routes(_: Bridge, folder: Path) -> APIRouter:
     @router.get("/sessions/{name}", response_model=SessionEntry)
     async def session(name: SessionName) -> SessionEntry:
         """One session."""
-        return await disk.ask(lambda: _make_entry(look_at(find_session(folder, name))))
+        return await disk.ask(lambda: _make_entry(inspect_session(find_session(folder, name))))
 
     @router.get(
         "/sessions/{name}/report.html", response_class=Response, responses={200: {"content": {"text/html": {}}}}
