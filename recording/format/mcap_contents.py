@@ -72,8 +72,8 @@ class ContentDigest:
     def know(self, channel: Channel, schema: Schema | None) -> None:
         """A channel, before its first message; its numbers do not count, for every writer gives its own."""
         names = ("", "") if schema is None else (schema.name, schema.encoding)
-        said = [channel.topic, channel.message_encoding, *names, sorted(channel.metadata.items())]
-        begun = hashlib.sha256(json.dumps(said).encode())
+        described = [channel.topic, channel.message_encoding, *names, sorted(channel.metadata.items())]
+        begun = hashlib.sha256(json.dumps(described).encode())
         begun.update(hashlib.sha256(b"" if schema is None else schema.data).digest())
         self._begun[channel.id], self._topics[channel.id] = begun, channel.topic
 

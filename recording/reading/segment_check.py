@@ -119,7 +119,7 @@ def check_segment(
 
 
 def _take_rewritten(check: SegmentCheck, found: McapContents, receive: Callable[[RecordedMessage], None]) -> None:
-    """What another program has written: all of it was read, and each CRC that it states is right."""
+    """Take over what another program has written: all of it was read, and each CRC that it states is right."""
     check.metadata = dict(found.metadata)
     check.texts = {
         name: each.data.decode(errors="surrogateescape")

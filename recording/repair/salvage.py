@@ -315,8 +315,8 @@ def _salvage_number(finished: Path, finished_too: bool, share: ShareProgress) ->
 
 def _leave_rewritten(path: Path, found: McapContents) -> Salvaged:
     """A valid segment that another program has written is not touched."""
-    said = judge_rewritten(found, _find_listed(path)).text
-    return Salvaged(path, path, len(found), 0, said, None, is_rewritten=True)
+    judgement = judge_rewritten(found, _find_listed(path)).text
+    return Salvaged(path, path, len(found), 0, judgement, None, is_rewritten=True)
 
 
 def _find_listed(path: Path) -> Sealed | None:

@@ -106,9 +106,9 @@ def test_messages_that_are_missing_are_counted(session):
     assert "4 of 4 on /log" in found.text
     with pytest.raises(SessionError, match="lacks messages"):
         open_whole(session)
-    said = []
-    assert open_whole(session, said.append).frame_count == 20
-    assert found.text in said[0]
+    warned = []
+    assert open_whole(session, warned.append).frame_count == 20
+    assert found.text in warned[0]
 
 
 def change_a_byte(topic, data):
@@ -116,7 +116,7 @@ def change_a_byte(topic, data):
 
 
 @pytest.mark.parametrize("depth", Depth)
-def test_content_that_was_changed_is_said_as_such(session, depth):
+def test_content_that_was_changed_is_reported(session, depth):
     rewrite(session / TELEMETRY / "0001.mcap", Form(change=change_a_byte))
     found = scan(session, depth)
     assert found.files is Files.CHANGED
@@ -238,7 +238,7 @@ def test_an_export_of_a_repaired_session_says_so(session, tmp_path):
     assert verify(session).files is Files.SOUND
     export(Session.open(session), tmp_path / "out", report=ignore)
     export_mcap(Session.open(session), tmp_path / "out.mcap", report=ignore)
-    said = read_contents(tmp_path / "out.mcap").metadata["export"]
-    for text in ((tmp_path / "out" / "README.txt").read_text(), said["findings"]):
+    exported = read_contents(tmp_path / "out.mcap").metadata["export"]
+    for text in ((tmp_path / "out" / "README.txt").read_text(), exported["findings"]):
         assert "frames/0001.mcap: was repaired" in text
-    assert said["files"] == "sound"
+    assert exported["files"] == "sound"

@@ -93,7 +93,7 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
 
     @router.post("/recipes/preview", response_model=RunPreview)
     async def preview(body: RunRequest) -> Response:
-        """What a recipe would do on this stand now: its course over time, frames, bytes, end; queues nothing."""
+        """Return what a recipe would do on this stand now: its course over time, frames, bytes, end; queues nothing."""
         return _make_response(await bridge.ask(lambda service: service.preview(body)))
 
     @router.get("/queue", response_model=list[QueuedRun])
@@ -131,7 +131,7 @@ def _make_endpoint(bridge: Bridge, command: Command) -> Any:
             parameters.append(_make_parameter(_KEY, Annotated[str, Header(max_length=200)], ""))
 
     async def endpoint(request: Request, **given: Any) -> Response:
-        who = cast("Who", request.state.who)
+        who = cast("Requester", request.state.who)
         if command.name == STOP:
             return _make_response(await bridge.stop(who))
         return _make_response(await bridge.perform(command.name, who, _make_argument(command, given)), command.status)
