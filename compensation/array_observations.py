@@ -313,7 +313,7 @@ def _check_roles(table: Spreadsheet) -> list[str]:
     return roles
 
 
-_SPACING_mm = 1.0
+_SPACING_mm = 1.0  # only ratios of the made-up grid count
 # A fit's own covariance is symmetric to rounding only; given back as it is, it has to be accepted.
 _ROUNDING = 1e-9
 
@@ -413,7 +413,7 @@ def observations_of(
 
 
 def _list_unknown(is_unknown: Mapping[str, bool], sigma_px: float) -> dict[str, str]:
-    """What follows from each thing that is not known."""
+    """Return what follows from each thing that is not known."""
     meaning = {
         "times": "times: drift with time, as while switching on, cannot be separated from drift with temperature",
         "air": "the air near the camera, and its history: the thermal form, which has lags, cannot be fitted",

@@ -123,13 +123,32 @@ class SessionFacts:
 class Observations:
     """F frames of a target with N markers, in order of time within each of the sessions.
 
-    session (F,): index into `sessions`. frame (F,): number within its session, from 0. time_ns (F,) int64. role (F,):
-    values of Role. chamber_degC (F,): set-point. camera_degC (F,): the camera's own temperature. air_degC (F,): near
-    the camera. Temperatures are NaN when unknown. centres_px (F, N, 2), covariance_px2 (F, N, 2, 2): NaN when the
-    marker is missing or flagged. flags (F, N): of markers.Flag. reasons (F): why the frame cannot be used, "" when it
-    can. preview: the first usable frame, reduced, grey. image_size: (width, height) of the frames, px. histories: what
-    each of the sessions recorded of the camera's surroundings; empty when that is not known. not_known: what arrays and
-    tables do not say (times, air, supply, set_points, uncertainty), and what is taken instead.
+    Attributes
+    ----------
+    session
+        (F,), index into `sessions`.
+    frame
+        (F,), number within its session, from 0.
+    time_ns
+        (F,) int64, the middle of the exposure.
+    role
+        (F,), values of `Role`.
+    chamber_degC, camera_degC, air_degC
+        (F,): the set-point, the camera's own temperature, and that of the air near the camera; NaN when unknown.
+    centres_px, covariance_px2
+        (F, N, 2) as (x, y), and (F, N, 2, 2); NaN when the marker is missing or flagged.
+    flags
+        (F, N), bits of `Flag`.
+    reasons
+        (F,): why the frame cannot be used, "" when it can.
+    preview
+        The first usable frame, reduced, grey.
+    image_size
+        (width, height) of the frames, px.
+    histories
+        What each of the sessions recorded of the camera's surroundings; empty when that is not known.
+    not_known
+        What arrays and tables do not say (times, air, supply, set_points, uncertainty), and what is taken instead.
     """
 
     target: Target

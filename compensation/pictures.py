@@ -146,7 +146,7 @@ def add_table(
 
 
 def _read_rows(table: Spreadsheet, mapping: MeasurementMapping) -> list[Picture]:
-    """What each row says, of a picture that is still to be found."""
+    """Return what each row says, of a picture that is still to be found."""
     times, roles = mapping.parse_times(table) or [None] * len(table.lines), mapping.parse_roles(table)
     named: dict[OurColumn, list[float]] = {}
     for ours in ("camera_degC", "chamber_degC", "air_degC"):
@@ -182,23 +182,23 @@ def _assign_rows(
     return [found[number] for number in sorted(found)]
 
 
-def _merge(picture: Picture, said: Picture, table: Spreadsheet, row: int) -> Picture:
+def _merge(picture: Picture, from_table: Picture, table: Spreadsheet, row: int) -> Picture:
     """A picture with what a row says; SessionError when its name says otherwise."""
-    if abs(said.camera_degC - picture.camera_degC) > _SAME_K:
+    if abs(from_table.camera_degC - picture.camera_degC) > _SAME_K:
         raise table.fault(
             row,
-            f"{picture.name} is at {picture.camera_degC:g} degC by its name, and at {said.camera_degC:g} by the table",
+            f"{picture.name} is at {picture.camera_degC:g} degC by its name, and at {from_table.camera_degC:g} by the table",
         )
-    from_row = math.isfinite(said.camera_degC)
-    set_point = said.chamber_degC if math.isfinite(said.chamber_degC) else picture.chamber_degC
+    from_row = math.isfinite(from_table.camera_degC)
+    set_point = from_table.chamber_degC if math.isfinite(from_table.chamber_degC) else picture.chamber_degC
     return replace(
         picture,
-        place=picture.place or said.place,
-        time_ns=picture.time_ns if said.time_ns is None else said.time_ns,
-        role=said.role,
-        camera_degC=said.camera_degC if from_row else picture.camera_degC,
+        place=picture.place or from_table.place,
+        time_ns=picture.time_ns if from_table.time_ns is None else from_table.time_ns,
+        role=from_table.role,
+        camera_degC=from_table.camera_degC if from_row else picture.camera_degC,
         chamber_degC=set_point,
-        air_degC=said.air_degC,
+        air_degC=from_table.air_degC,
     )
 
 
@@ -227,8 +227,8 @@ def _interpolate_log(
     before = np.clip(np.searchsorted(instants, at_ns, side="right") - 1, 0, None)
     found: list[Picture] = []
     for picture, row, own_degC, its_air_degC in zip(pictures, before.tolist(), camera_degC, air_degC, strict=True):
-        said = replace(rows[row], time_ns=None, camera_degC=float(own_degC), air_degC=float(its_air_degC))
-        found.append(_merge(picture, said, table, row))
+        from_table = replace(rows[row], time_ns=None, camera_degC=float(own_degC), air_degC=float(its_air_degC))
+        found.append(_merge(picture, from_table, table, row))
     return found, [Reading(time_ns, row.camera_degC, row.air_degC) for time_ns, row in zip(times, rows, strict=True)]
 
 
@@ -400,7 +400,7 @@ def _format_degC(value: float) -> str:
 
 
 def read_pose_spread(pictures: Iterable[Placed]) -> dict[str, tuple[float, float]]:
-    """How far the poses of the target that are stated with the pictures differ within each session: the largest
+    """Return how far the poses of the target that are stated with the pictures differ within each session: the largest
     distance from the first one, in the files' own unit, and angle, deg. SessionError for a file that is no 4x4 pose."""
     firsts: dict[str, Float] = {}
     spread: dict[str, tuple[float, float]] = {}

@@ -56,11 +56,11 @@ class Spreadsheet:
         return folded.index(name.casefold()) if name.casefold() in folded else None
 
     def has(self, name: str) -> bool:
-        """Whether there is a column of this name, whatever its capitals."""
+        """Return whether there is a column of this name, whatever its capitals."""
         return self.find(name) is not None
 
     def states(self, name: str) -> bool:
-        """Whether there is such a column, and any text in it."""
+        """Return whether there is such a column, and any text in it."""
         return self.has(name) and any(self.column(name))
 
     def column(self, name: str) -> list[str]:
@@ -148,7 +148,7 @@ class Spreadsheet:
 
 
 def is_spreadsheet(path: Path) -> bool:
-    """Whether the name says that it is a table."""
+    """Return whether the name says that it is a table."""
     return path.suffix.lower() in SUFFIXES
 
 
@@ -237,7 +237,7 @@ def _make_spreadsheet(path: Path, rows: list[list[str]], numbers: list[int]) -> 
 
 
 def _find_decimal_sign(cells: list[str]) -> str:
-    """Which sign is the decimal one in a column, or one of the other answers above."""
+    """Return which sign is the decimal one in a column, or one of the other answers above."""
     text = "\n".join(cells)
     if "," not in text and "." not in text:
         return _UNSTATED
@@ -248,7 +248,7 @@ def _find_decimal_sign(cells: list[str]) -> str:
 
 
 def _vote(text: str) -> str:
-    """What one cell says of the decimal sign of its column."""
+    """Return what one cell says of the decimal sign of its column."""
     match = _NUMBER.fullmatch(text)
     if match is None:
         return _UNSTATED
@@ -267,7 +267,7 @@ def _vote(text: str) -> str:
 
 
 def _is_grouped(body: str, sign: str) -> bool:
-    """Whether the digits stand in threes, as in 1,234,567."""
+    """Return whether the digits stand in threes, as in 1,234,567."""
     first, *others = body.split(sign)
     return 1 <= len(first) <= 3 and first[0] != "0" and all(len(other) == 3 for other in others)
 

@@ -199,11 +199,11 @@ _accepting: list[Callable[[str], None]] = []
 def accept_unsynced_folders(say: Callable[[str], None]) -> Generator[None]:
     """While inside, a file system that cannot sync folders is no error: `say` gets one sentence about it. For commands
     that somebody runs on an exchange disk, and can run again; what must be durable stays strict."""
-    said: set[str] = set()
+    warned: set[str] = set()
 
     def say_once(text: str) -> None:
-        if not said:
-            said.add(text)
+        if not warned:
+            warned.add(text)
             say(text)
 
     _accepting.append(say_once)

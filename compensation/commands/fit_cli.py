@@ -241,7 +241,7 @@ def _list_unknown(observations: Observations) -> list[str]:
 
 
 def _list_equipment(source: Path, observations: Observations) -> list[Line]:
-    """What a session was recorded with; of a table, what it does not say."""
+    """Return what a session was recorded with; of a table, what it does not say."""
     if is_spreadsheet(source):
         return [("Not known", text) for text in observations.not_known.values()]
     return list_equipment(Session.open(source))

@@ -43,7 +43,7 @@ class Contribution:
 
     @property
     def amount(self) -> float:
-        """In the quantity's unit."""
+        """The standard uncertainty that this contributes, in the quantity's unit."""
         return abs(self.sensitivity) * self.u
 
 
@@ -62,7 +62,7 @@ class MeasuredQuantity:
     why: str = ""
 
     def found(self, value: float, *contributions: Contribution) -> MeasuredQuantity:
-        """With this value and its budget."""
+        """Return this quantity with that value and its budget."""
         return replace(self, value=value, contributions=contributions, why="")
 
     @property
@@ -298,7 +298,7 @@ class Curve:
 
 
 def fit_curve(visits: Visits, motion: int) -> Curve | None:
-    """None when there are too few visits to say how they scatter."""
+    """Fit the curve of a motion; None when the visits are too few to show how they scatter."""
     count = len(visits.base_degC)
     if count < _FEWEST_VISITS or len(np.unique(visits.chamber_degC)) < 4:
         return None
@@ -321,7 +321,7 @@ def fit_curve(visits: Visits, motion: int) -> Curve | None:
 
 
 def compute_coefficients(visits: Visits, u_air_K: float, target_ppm_per_K: float) -> Iterator[MeasuredQuantity]:
-    """Of the four motions."""
+    """Compute the temperature coefficients of the four motions."""
     for motion, (key, name, unit) in enumerate(zip(MOTIONS, NAMES, UNITS, strict=True)):
         fitted, per_K = fit_curve(visits, motion), f"{unit}/K"
         group, model = (f"{_GROUP}{_BY_CAMERA}", _CAMERA_MODEL) if visits.by_camera else (_GROUP, _AIR_MODEL)
@@ -372,7 +372,7 @@ def compute_warm_up_quantities(
 
 
 def _make_unknown_quantity(key: str, name: str, unit: str, model: str = "", why: str = _NO_WARM_UP) -> MeasuredQuantity:
-    """Not known yet, and why that may stay so."""
+    """Make a quantity that is not known yet, with the reason."""
     return MeasuredQuantity(key, _SWITCHING_ON, name, unit, model, why=why)
 
 
@@ -489,8 +489,9 @@ def _compute_self_heating(visits: Visits, u_air_K: float) -> MeasuredQuantity:
 def _compute_camera_share(
     warming: Warming | None, visits: Visits, scatter: Sequence[float], u_air_K: float
 ) -> MeasuredQuantity:
-    """Of the shift per K of the air, how much the camera's own warming moves the image per K of its own sensor. The
-    rest follows the surroundings: mount, fixture, and what of the camera stays at the air's temperature then."""
+    """Compute, of the shift per K of the air, how much the camera's own warming moves the image per K of its own
+    sensor. The rest follows the surroundings: mount, fixture, and what of the camera stays at the air's temperature
+    then."""
     model = (
         "(h · c) / (c · c); h: shift in the warm-up per K of the camera's sensor, c: shift per K of the air; the rest "
         "follows mount and surroundings, which are taken to stay at the air's temperature in the warm-up; above 100 % "

@@ -234,7 +234,7 @@ def _none_if_not_finite(value: float) -> float | None:
 
 
 def _format_span(sheet: Datasheet) -> list[str]:
-    """When the first and the last frame were taken; nothing where that is not known."""
+    """Return when the first and the last frame were taken; nothing where that is not known."""
     observed = sheet.observations
     if "times" in observed.not_known:
         return []

@@ -68,7 +68,7 @@ def list_segments(directory: Path) -> tuple[SegmentFile, ...]:
 
 
 def _is_like_segment(name: str) -> bool:
-    """Whether it has an ending of segments, in small letters, capitals or cut short."""
+    """Return whether it has an ending of segments, in small letters, capitals or cut short."""
     return name.lower().endswith(tuple(_STATE)) or _CHANGED_SEGMENT.fullmatch(name) is not None
 
 
@@ -90,8 +90,8 @@ _CHANGED_SEGMENT = re.compile(r"\d{4,}(~\d+)?\.(mca|mcap|mcap\.part|par|mcap\.da
 
 
 def explain_changed_names(directory: Path) -> str:
-    """Why no segment is found where a file system has changed their names, as the part of a sentence; "" when it has
-    not."""
+    """Return why no segment is found where a file system has changed their names, as the part of a sentence; "" when it
+    has not."""
     with suppress(OSError):
         for folder in sorted(path for path in directory.iterdir() if _CHANGED_FOLDER.fullmatch(path.name)):
             for path in sorted(folder.iterdir()):

@@ -51,8 +51,8 @@ def temperature_bins(training: Observations) -> Corrector:
         found[number] = np.linalg.lstsq(terms, (reference_px - seen_px)[known].ravel(), rcond=None)[0]
     filled = np.flatnonzero(np.isfinite(found[:, 0]))
 
-    def corrected(night: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
-        wanted = _find_bins(night.camera_degC[asked])
+    def corrected(session: Observations, asked: NDArray[np.int64], seen_px: Float) -> Correction:
+        wanted = _find_bins(session.camera_degC[asked])
         nearest = filled[np.abs(wanted[:, None] - filled).argmin(axis=1)]
         moved = [
             (_similarity_terms(seen) @ found[one]).reshape(-1, 2) for seen, one in zip(seen_px, nearest, strict=True)

@@ -31,7 +31,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "use-other-data.md"
 TEMPERATURES = (10, 13, 16, 19, 22, 25, 28, 31, 34)
 DISTANCES = (700, 800)
 BEGIN = datetime(2026, 1, 8, 18, 0, 0, tzinfo=UTC)
-NIGHT = ("observe", "night", "--table", "log.csv", "--mapping", "m.yaml", "--target", "small.yaml")
+WITH_TABLE = ("observe", "series", "--table", "log.csv", "--mapping", "m.yaml", "--target", "small.yaml")
 PLACES = np.array([[60.0, 50.0], [160.0, 120.0], [250.0, 200.0]])
 
 
@@ -108,13 +108,13 @@ def make_measurement(folder: Path, source: Path) -> list[Path]:
 def test_pictures_with_the_temperature_in_their_names_give_a_model_a_report_and_a_datasheet(
     folder: Path, observed: dict[str, object]
 ):
-    said = observed
-    assert said["pictures"] == len(TEMPERATURES) * len(DISTANCES) * 2
-    assert said["sessions"] == ["centres p0700", "centres p0800"]
-    assert said["reference_degC"] == REFERENCE_DEGC
-    assert said["not_used"] == []
-    assert said["stated_poses"] == {"p0700": [0.0, 0.0], "p0800": [0.0, 0.0]}
-    assert set(said["not_known"]) == {"times", "air"}  # pyright: ignore[reportArgumentType]
+    shown = observed
+    assert shown["pictures"] == len(TEMPERATURES) * len(DISTANCES) * 2
+    assert shown["sessions"] == ["centres p0700", "centres p0800"]
+    assert shown["reference_degC"] == REFERENCE_DEGC
+    assert shown["not_used"] == []
+    assert shown["stated_poses"] == {"p0700": [0.0, 0.0], "p0800": [0.0, 0.0]}
+    assert set(shown["not_known"]) == {"times", "air"}  # pyright: ignore[reportArgumentType]
     fitted = run(folder, "fit", "centres.csv", "-o", "model.json")
     assert fitted["form"] == "paper"
     assert set(fitted["not_known"]) == {"times", "air"}  # pyright: ignore[reportArgumentType]
@@ -148,10 +148,10 @@ def test_the_layout_of_the_public_set_is_read_with_its_index(folder: Path, tmp_p
         rows += [f"{name}_color.png  color {degC[1:]} {place[1:]}", f"{name}_depth.png  depth {degC[1:]} {place[1:]}"]
     (made / "index.csv").write_text("\n".join(rows) + "\n")
     write_target(tmp_path)
-    said = run(tmp_path, "observe", "set", "--target", "small.yaml", "-o", "centres.csv")
-    assert said["pictures"] == len(TEMPERATURES) * len(DISTANCES) * 2
-    assert said["sessions"] == ["centres p0700", "centres p0800"]
-    assert said["stated_poses"] == {"p0700": [0.0, 0.0], "p0800": [0.0, 0.0]}
+    shown = run(tmp_path, "observe", "set", "--target", "small.yaml", "-o", "centres.csv")
+    assert shown["pictures"] == len(TEMPERATURES) * len(DISTANCES) * 2
+    assert shown["sessions"] == ["centres p0700", "centres p0800"]
+    assert shown["stated_poses"] == {"p0700": [0.0, 0.0], "p0800": [0.0, 0.0]}
     (made / "index.csv").write_text("\n".join(rows).replace("color 10 ", "color 25 ") + "\n")
     text = refuse(tmp_path, "observe", "set", "--target", "small.yaml", "-o", "refused.csv")
     assert "index.csv: line 2:" in text
@@ -164,11 +164,11 @@ def test_pictures_and_a_german_table_with_a_mapping(folder: Path, tmp_path: Path
     write_german_table(tmp_path / "messung", renamed)
     write_target(tmp_path)
     (tmp_path / "messung.yaml").write_text(find_blocks("yaml")[0])
-    said = run(
+    shown = run(
         tmp_path, "observe", "messung", "--mapping", "messung.yaml", "--target", "small.yaml", "-o", "centres.csv"
     )
-    assert said["pictures"] == len(paths)
-    assert set(said["not_known"]) == {"supply"}  # pyright: ignore[reportArgumentType]
+    assert shown["pictures"] == len(paths)
+    assert set(shown["not_known"]) == {"supply"}  # pyright: ignore[reportArgumentType]
     found = load_observations(tmp_path / "centres.csv")
     assert found.image_size == (320, 256)
     assert found.role.tolist() == ["reference" if p.parts[-3] == f"t{REFERENCE_DEGC}" else "fit" for p in paths]
@@ -181,7 +181,7 @@ def test_pictures_and_a_german_table_with_a_mapping(folder: Path, tmp_path: Path
 
 
 def test_pictures_take_from_a_log_what_it_says_at_their_time(folder: Path, tmp_path: Path):
-    made = tmp_path / "night"
+    made = tmp_path / "series"
     made.mkdir()
     paths = sorted(folder.glob("pictures/t*/p0700/*.png"))
     log = ["when,sensor,air"]
@@ -194,13 +194,13 @@ def test_pictures_take_from_a_log_what_it_says_at_their_time(folder: Path, tmp_p
     (tmp_path / "m.yaml").write_text(
         "columns: {time: when, camera_degC: sensor, air_degC: air}\ntime_unit: s\ntime_in_name: '%Y%m%dT%H%M%S'\n"
     )
-    run(tmp_path, *NIGHT, "-o", "c.csv")
+    run(tmp_path, *WITH_TABLE, "-o", "c.csv")
     found = load_observations(tmp_path / "c.csv")
     assert found.camera_degC.tolist() == [int(path.parts[-3][1:]) for path in paths]
     (history,) = found.histories
     assert len(history.ambient_ns) == 3 * len(paths)  # the frames', and two readings about each
     (tmp_path / "m.yaml").write_text("columns: {time: when, camera_degC: sensor}\ntime_unit: s\n")
-    text = refuse(tmp_path, *NIGHT, "-o", "refused.csv")
+    text = refuse(tmp_path, *WITH_TABLE, "-o", "refused.csv")
     assert "time_in_name" in text
 
 
@@ -214,9 +214,9 @@ def test_a_target_that_was_moved_is_not_taken_for_drift(moved: str, tmp_path: Pa
     if moved == "no place is seen twice":
         assert "no place of the target was seen at the reference and at another" in refuse(tmp_path, *arguments)
         return
-    said = run(tmp_path, *arguments)
+    shown = run(tmp_path, *arguments)
     found = load_observations(tmp_path / "refused.csv")
-    assert said["sessions"] == ["refused place-1", "refused place-2"]
+    assert shown["sessions"] == ["refused place-1", "refused place-2"]
     assert found.role.tolist().count("other") == 1
 
 

@@ -71,7 +71,7 @@ def test_an_interrupted_repair_without_hard_links_keeps_one_copy(session, monkey
     assert [path.name for path in (session / FRAMES).glob("*.damaged")] == ["0001.mcap.damaged"]
 
 
-def test_when_there_is_no_space_for_the_copy_nothing_is_changed(session, monkeypatch):
+def test_without_space_for_the_copy_nothing_is_changed(session, monkeypatch):
     before = damage(session)
     monkeypatch.setattr(os, "link", refuse(errno.EPERM))
     monkeypatch.setattr("thermostand.recording.repair.salvage.copyfile", refuse(errno.ENOSPC))
@@ -94,7 +94,7 @@ def unsyncable(monkeypatch):
     monkeypatch.setattr(os, "fsync", only_files)
 
 
-def test_folders_that_cannot_be_synced_are_said_once_and_repair_goes_on(session, unsyncable):
+def test_folders_that_cannot_be_synced_are_reported_once_and_repair_goes_on(session, unsyncable):
     damage(session)
     said = []
     with accept_unsynced_folders(said.append):
@@ -105,7 +105,7 @@ def test_folders_that_cannot_be_synced_are_said_once_and_repair_goes_on(session,
     assert "cannot sync folders (Invalid argument)" in sentence
 
 
-def test_what_must_be_durable_is_refused_there_with_the_cause(session, unsyncable):
+def test_what_must_be_durable_is_refused_with_the_cause(session, unsyncable):
     with pytest.raises(OSError, match="cannot sync folders") as raised:
         sync_folder(session)
     assert raised.value.errno == errno.EINVAL
@@ -132,7 +132,7 @@ def only_the_files(session):
 
 
 @pytest.mark.parametrize("change", [capitals, cut_short, only_the_files])
-def test_names_that_a_file_system_has_changed_are_said_with_what_to_do(session, change):
+def test_names_that_a_file_system_has_changed_are_reported_with_what_to_do(session, change):
     change(session)
     for read in (scan, verify, Session.open, salvage_session):
         with pytest.raises(SessionError, match="a file system has changed its names") as raised:

@@ -38,8 +38,8 @@ async def exported(tmp_path):
     await record(tmp_path / "s")
     add_note(tmp_path / "s", "windy", "eva", 1)
     session = Session.open(tmp_path / "s")
-    export_nexus(session, tmp_path / "night.nxs", report=ignore)
-    return session, tmp_path / "night.nxs"
+    export_nexus(session, tmp_path / "cycle.nxs", report=ignore)
+    return session, tmp_path / "cycle.nxs"
 
 
 def test_every_frame_and_reading_is_in_the_file(exported):
@@ -104,8 +104,8 @@ def test_silx_and_nexusformat_open_the_file(exported):
 async def test_frames_of_16_bits_are_not_cut(tmp_path):
     await record(tmp_path / "s", 3, lambda time_ns, index: make_half_second(time_ns, index, np.uint16))
     session = Session.open(tmp_path / "s")
-    export_nexus(session, tmp_path / "night.nxs", telemetry=False, report=ignore)
-    with open_hdf5(tmp_path / "night.nxs") as file:
+    export_nexus(session, tmp_path / "cycle.nxs", telemetry=False, report=ignore)
+    with open_hdf5(tmp_path / "cycle.nxs") as file:
         assert [image.tobytes() for image in file["entry/instrument/camera/data"]] == [
             frame.image.tobytes() for frame in session.frames()
         ]
@@ -161,13 +161,13 @@ def load(metadata, folder) -> Any:
 def test_the_crate_of_each_export_is_read_by_rocrate(exported, tmp_path):
     session, path = exported
     export(session, tmp_path / "tables", report=ignore)
-    export_mcap(session, tmp_path / "night.mcap", report=ignore)
-    for each in (path, tmp_path / "night.mcap"):
+    export_mcap(session, tmp_path / "cycle.mcap", report=ignore)
+    for each in (path, tmp_path / "cycle.mcap"):
         write_crate(session, each)
     crates = {
         "tables": load(tmp_path / "tables" / CRATE_NAME, tmp_path / "tables"),
-        "nexus": load(tmp_path / f"night.nxs-{CRATE_NAME}", tmp_path / "of-nexus"),
-        "mcap": load(tmp_path / f"night.mcap-{CRATE_NAME}", tmp_path / "of-mcap"),
+        "nexus": load(tmp_path / f"cycle.nxs-{CRATE_NAME}", tmp_path / "of-nexus"),
+        "mcap": load(tmp_path / f"cycle.mcap-{CRATE_NAME}", tmp_path / "of-mcap"),
     }
     for crate in crates.values():
         root = crate.root_dataset
@@ -179,7 +179,7 @@ def test_the_crate_of_each_export_is_read_by_rocrate(exported, tmp_path):
         each.name + "/" * each.is_dir() for each in (tmp_path / "tables").iterdir() if each.name != CRATE_NAME
     }
     (part,) = crates["nexus"].root_dataset["hasPart"]
-    assert (part.id, int(part["contentSize"])) == ("night.nxs", path.stat().st_size)
+    assert (part.id, int(part["contentSize"])) == ("cycle.nxs", path.stat().st_size)
     graph = json.loads((tmp_path / "tables" / CRATE_NAME).read_text(encoding="utf-8"))["@graph"]
     ids = [entity["@id"] for entity in graph]
     assert len(set(ids)) == len(ids)

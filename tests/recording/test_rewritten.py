@@ -35,12 +35,12 @@ def ignore(share, text):
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A complete run; not to be changed."""
-    return asyncio.run(record_run(tmp_path_factory.mktemp("recorded") / "night-1"))
+    return asyncio.run(record_run(tmp_path_factory.mktemp("recorded") / "cycle-1"))
 
 
 @pytest.fixture
 def session(recorded, tmp_path):
-    return Path(shutil.copytree(recorded, tmp_path / "night-1"))
+    return Path(shutil.copytree(recorded, tmp_path / "cycle-1"))
 
 
 def names(directory):
@@ -215,7 +215,7 @@ def test_a_file_that_is_no_recording_makes_no_session(session, tmp_path):
     write_strange(tmp_path / "bag.mcap")
     data = (session / TELEMETRY / "0001.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[:-20])
-    (tmp_path / "text.mcap").write_text("a cloudy night")
+    (tmp_path / "text.mcap").write_text("a cloudy day")
     for name in ("bag", "cut", "text"):
         with pytest.raises(SessionError, match=name):
             import_mcap(tmp_path / f"{name}.mcap", tmp_path / "again", ignore)
@@ -223,7 +223,7 @@ def test_a_file_that_is_no_recording_makes_no_session(session, tmp_path):
 
 
 async def test_a_replayed_copy_keeps_journal_and_notes(recorded, tmp_path):
-    session = Path(shutil.copytree(recorded, tmp_path / "night-1"))
+    session = Path(shutil.copytree(recorded, tmp_path / "cycle-1"))
     add_note(session, "windy", "eva", 1)
     copy = await replay_and_record(Session.open(session), tmp_path / "copy", None)
     assert read_notes(copy) == read_notes(session)
