@@ -182,23 +182,23 @@ def _assign_rows(
     return [found[number] for number in sorted(found)]
 
 
-def _merge(picture: Picture, from_table: Picture, table: Spreadsheet, row: int) -> Picture:
+def _merge(picture: Picture, stated: Picture, table: Spreadsheet, row: int) -> Picture:
     """A picture with what a row says; SessionError when its name says otherwise."""
-    if abs(from_table.camera_degC - picture.camera_degC) > _SAME_K:
+    if abs(stated.camera_degC - picture.camera_degC) > _SAME_K:
         raise table.fault(
             row,
-            f"{picture.name} is at {picture.camera_degC:g} degC by its name, and at {from_table.camera_degC:g} by the table",
+            f"{picture.name} is at {picture.camera_degC:g} degC by its name, and at {stated.camera_degC:g} by the table",
         )
-    from_row = math.isfinite(from_table.camera_degC)
-    set_point = from_table.chamber_degC if math.isfinite(from_table.chamber_degC) else picture.chamber_degC
+    from_row = math.isfinite(stated.camera_degC)
+    set_point = stated.chamber_degC if math.isfinite(stated.chamber_degC) else picture.chamber_degC
     return replace(
         picture,
-        place=picture.place or from_table.place,
-        time_ns=picture.time_ns if from_table.time_ns is None else from_table.time_ns,
-        role=from_table.role,
-        camera_degC=from_table.camera_degC if from_row else picture.camera_degC,
+        place=picture.place or stated.place,
+        time_ns=picture.time_ns if stated.time_ns is None else stated.time_ns,
+        role=stated.role,
+        camera_degC=stated.camera_degC if from_row else picture.camera_degC,
         chamber_degC=set_point,
-        air_degC=from_table.air_degC,
+        air_degC=stated.air_degC,
     )
 
 
@@ -227,8 +227,8 @@ def _interpolate_log(
     before = np.clip(np.searchsorted(instants, at_ns, side="right") - 1, 0, None)
     found: list[Picture] = []
     for picture, row, own_degC, its_air_degC in zip(pictures, before.tolist(), camera_degC, air_degC, strict=True):
-        from_table = replace(rows[row], time_ns=None, camera_degC=float(own_degC), air_degC=float(its_air_degC))
-        found.append(_merge(picture, from_table, table, row))
+        stated = replace(rows[row], time_ns=None, camera_degC=float(own_degC), air_degC=float(its_air_degC))
+        found.append(_merge(picture, stated, table, row))
     return found, [Reading(time_ns, row.camera_degC, row.air_degC) for time_ns, row in zip(times, rows, strict=True)]
 
 

@@ -96,11 +96,11 @@ def unsyncable(monkeypatch):
 
 def test_folders_that_cannot_be_synced_are_reported_once_and_repair_goes_on(session, unsyncable):
     damage(session)
-    said = []
-    with accept_unsynced_folders(said.append):
+    reports = []
+    with accept_unsynced_folders(reports.append):
         (done,) = salvage_session(session)
     assert done.kept is not None
-    (sentence,) = said
+    (sentence,) = reports
     assert str(session / FRAMES) in sentence
     assert "cannot sync folders (Invalid argument)" in sentence
 
