@@ -182,23 +182,23 @@ def _assign_rows(
     return [found[number] for number in sorted(found)]
 
 
-def _merge(picture: Picture, stated: Picture, table: Spreadsheet, row: int) -> Picture:
+def _merge(picture: Picture, noted: Picture, table: Spreadsheet, row: int) -> Picture:
     """A picture with what a row says; SessionError when its name says otherwise."""
-    if abs(stated.camera_degC - picture.camera_degC) > _SAME_K:
+    if abs(noted.camera_degC - picture.camera_degC) > _SAME_K:
         raise table.fault(
             row,
-            f"{picture.name} is at {picture.camera_degC:g} degC by its name, and at {stated.camera_degC:g} by the table",
+            f"{picture.name} is at {picture.camera_degC:g} degC by its name, and at {noted.camera_degC:g} by the table",
         )
-    from_row = math.isfinite(stated.camera_degC)
-    set_point = stated.chamber_degC if math.isfinite(stated.chamber_degC) else picture.chamber_degC
+    from_row = math.isfinite(noted.camera_degC)
+    set_point = noted.chamber_degC if math.isfinite(noted.chamber_degC) else picture.chamber_degC
     return replace(
         picture,
-        place=picture.place or stated.place,
-        time_ns=picture.time_ns if stated.time_ns is None else stated.time_ns,
-        role=stated.role,
-        camera_degC=stated.camera_degC if from_row else picture.camera_degC,
+        place=picture.place or noted.place,
+        time_ns=picture.time_ns if noted.time_ns is None else noted.time_ns,
+        role=noted.role,
+        camera_degC=noted.camera_degC if from_row else picture.camera_degC,
         chamber_degC=set_point,
-        air_degC=stated.air_degC,
+        air_degC=noted.air_degC,
     )
 
 
@@ -227,8 +227,8 @@ def _interpolate_log(
     before = np.clip(np.searchsorted(instants, at_ns, side="right") - 1, 0, None)
     found: list[Picture] = []
     for picture, row, own_degC, its_air_degC in zip(pictures, before.tolist(), camera_degC, air_degC, strict=True):
-        stated = replace(rows[row], time_ns=None, camera_degC=float(own_degC), air_degC=float(its_air_degC))
-        found.append(_merge(picture, stated, table, row))
+        noted = replace(rows[row], time_ns=None, camera_degC=float(own_degC), air_degC=float(its_air_degC))
+        found.append(_merge(picture, noted, table, row))
     return found, [Reading(time_ns, row.camera_degC, row.air_degC) for time_ns, row in zip(times, rows, strict=True)]
 
 
@@ -400,7 +400,7 @@ def _format_degC(value: float) -> str:
 
 
 def read_pose_spread(pictures: Iterable[Placed]) -> dict[str, tuple[float, float]]:
-    """Return how far the poses of the target that are stated with the pictures differ within each session: the largest
+    """Return how far the poses of the target that are noted with the pictures differ within each session: the largest
     distance from the first one, in the files' own unit, and angle, deg. SessionError for a file that is no 4x4 pose."""
     firsts: dict[str, Float] = {}
     spread: dict[str, tuple[float, float]] = {}
