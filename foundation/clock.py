@@ -271,8 +271,8 @@ def compute_call_pause_s(clock: Now, pause_s: float) -> float:
 
 
 def await_simulated_answers(clock: Now | None) -> bool:
-    """Whether a reply that has not come by now never comes, since the simulated devices have answered all that was
-    asked: they are waited for, however busy the host. False at once in real time, where nobody can know."""
+    """Return whether a reply that has not come by now never comes, since the simulated devices have answered all that
+    was asked: they are waited for, however busy the host. False at once in real time, where nobody can know."""
     if not isinstance(clock, VirtualClock) or clock.await_answers is None:
         return False
     clock.await_answers()

@@ -133,8 +133,8 @@ _LOOK_S = 0.0002  # between two looks at a wire that is behind
 
 
 def _is_behind(source: socket.socket | int, turn: threading.Lock, faults: LinkFaults) -> bool:
-    """Whether something that has arrived there is not answered yet. turn: held from before a request is taken to after
-    its reply was sent. What is late on purpose is not behind."""
+    """Return whether something that has arrived there is not answered yet. turn: held from before a request is taken to
+    after its reply was sent. What is late on purpose is not behind."""
     if not turn.acquire(blocking=False):
         return not faults.is_late
     try:
@@ -146,7 +146,7 @@ def _is_behind(source: socket.socket | int, turn: threading.Lock, faults: LinkFa
 
 
 def _await_input(source: socket.socket | int, timeout_s: float | None = None) -> bool:
-    """Whether something has arrived, or the other end has closed. OSError, ValueError when it is closed here."""
+    """Return whether something has arrived, or the other end has closed. OSError, ValueError when it is closed here."""
     arrived = select.poll()  # select() knows no descriptor above 1023
     arrived.register(source, select.POLLIN)
     return bool(arrived.poll(None if timeout_s is None else timeout_s * 1000.0))

@@ -70,8 +70,8 @@ class LineClient:
         is_text: bool = True,
         clock: Now | None = None,
     ) -> LineClient:
-        """Of the device at `serial:PATH`, with these settings, or `tcp:HOST:PORT`; times_s: time-out and gap; clock:
-        the stand's, without which a time-out is judged in real time alone."""
+        """Make the client of the device at `serial:PATH`, with these settings, or `tcp:HOST:PORT`; times_s: time-out
+        and gap."""
         is_kept = address.startswith("serial:")
         return cls(
             device, lambda: open_link(device, address, line), *times_s, is_kept=is_kept, is_text=is_text, clock=clock
@@ -118,8 +118,8 @@ class LineClient:
         return found
 
     def _is_undamaged(self, heard: bytes, before: bytes) -> bool:
-        """Whether a reply has as much flow control as the last one; or as the one `before`, to the same request, which
-        says as much."""
+        """Return whether a reply has as much flow control as the last one; or as the one `before`, to the same request,
+        which says as much."""
         count, count_before = self._flow_count(heard), self._flow_count(before)
         is_as_before = count == count_before or min(count, count_before) > 0
         if count != self._flow_bytes and not (is_as_before and _count_characters(heard) == _count_characters(before)):

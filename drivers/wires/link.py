@@ -53,8 +53,8 @@ class SerialSettings:
 
 
 def read_reply(link: ByteLink, deadline_s: float, clock: Now | None) -> bytes:
-    """What has arrived until time.monotonic() reaches `deadline_s`; b"" then. In virtual time a host that is busy must
-    not make a silent device: silent is one that has nothing left to answer."""
+    """Return what has arrived until time.monotonic() reaches `deadline_s`; b"" then. In virtual time a host that is
+    busy must not make a silent device: silent is one that has nothing left to answer."""
     left_s = deadline_s - time.monotonic()
     if left_s > 0 and (data := link.read(left_s)):
         return data

@@ -125,7 +125,7 @@ class XimcClient:
         raise Unreachable(self._device, "the controller does not answer, nor does it echo zeros")
 
     def _make_error(self, letters: str, frame: XimcFrame | None) -> DeviceError:
-        """What was wrong with the answer to `letters`."""
+        """Return what was wrong with the answer to `letters`."""
         if frame is None:
             return Unreachable(self._device, f"no answer to {letters} within {self._timeout_s:g} s")
         if frame.letters == "errc":

@@ -413,7 +413,7 @@ def _forget_foreign_chunks(source: Source, found: SegmentScan, opening: SegmentO
 
 
 def _is_frame(messages: list[StoredMessage], opening: SegmentOpening) -> bool:
-    """Whether they are a description and its image."""
+    """Return whether they are a description and its image."""
     names = [opening.schemas[opening.channels[each.channel].schema_id].name for each in messages]
     if names != [META_SCHEMA, IMAGE_SCHEMA]:
         return False
