@@ -72,7 +72,7 @@ def test_sessions_that_were_compared_outweigh_what_was_assumed() -> None:
     assert estimate_claims(rows, *left, STILL, np.full(9, 25.0)).factors[Question.WITHIN] < 2.5
 
 
-def test_how_well_sessions_repeat_is_said_to_be_assumed_or_shown() -> None:
+def test_how_well_sessions_repeat_is_stated_as_assumed_or_shown() -> None:
     assumed, shown = BetweenSessions((0.002, 0.003), 0), BetweenSessions((0.002, 0.003), 2)
     assert assumed.is_assumed
     assert "assumed, not measured: 2.0 mpx (I) and 3.0 mpx (J)" in assumed.text
