@@ -15,7 +15,7 @@ NO_HEAT_RESPONSE = guard_rule("no_heat_response", "the regulator heats hard, and
 TOO_MUCH_HEAT = guard_rule("too_much_heat", "more heat was given within an hour than the chamber ever needs")
 _LONGEST_LOOK_S = 60.0  # between two looks; what was given in a longer gap is not known
 _BEFORE_S = 30.0  # a stretch of heat begins: from here on a fall counts
-_MINUTE_S = 60.0
+_MINUTE_S, _HOUR_S = 60.0, 3600.0
 HARD_PERCENT = 50.0
 """More than any rest needs: at such an output the air must warm."""
 # 60 s are 2.4 lags of the heater: 9 % are still to come. Half of it would leave 30 %.
@@ -33,12 +33,13 @@ def compute_heat_percent(readings: Readings, regulator: str, permit: str) -> flo
 
 @dataclass(frozen=True, slots=True)
 class HeatTotal:
-    """Heat of the minutes that are over, Wh, oldest first, and of the one since `begun_ns`."""
+    """Heat of the minutes that are over, (begin ns, Wh), oldest first, and of the one since `begun_ns`; each ends at the
+    first look after 60 s, and may be longer."""
 
     begun_ns: int
     looked_ns: int
     running_Wh: float = 0.0
-    minutes_Wh: tuple[float, ...] = ()
+    minutes: tuple[tuple[int, float], ...] = ()
 
 
 def limit_heat_energy(max_Wh_per_h: float, heater_W: float, regulator: str, permit: str) -> Rule:
@@ -52,10 +53,11 @@ def limit_heat_energy(max_Wh_per_h: float, heater_W: float, regulator: str, perm
             last.running_Wh + compute_heat_percent(readings, regulator, permit) / 100 * heater_W * looked_s / 3600
         )
         if now_ns - last.begun_ns < to_ns(_MINUTE_S):
-            return HeatTotal(last.begun_ns, now_ns, running_Wh, last.minutes_Wh), None
-        minutes_Wh = (*last.minutes_Wh, running_Wh)[-60:]
-        given_Wh = sum(minutes_Wh)
-        state = HeatTotal(now_ns, now_ns, 0.0, minutes_Wh)
+            return HeatTotal(last.begun_ns, now_ns, running_Wh, last.minutes), None
+        since_ns = now_ns - to_ns(_HOUR_S)
+        minutes = tuple(each for each in (*last.minutes, (last.begun_ns, running_Wh)) if each[0] >= since_ns)
+        given_Wh = sum(Wh for _, Wh in minutes)
+        state = HeatTotal(now_ns, now_ns, 0.0, minutes)
         if given_Wh <= max_Wh_per_h:
             return state, None
         text = f"{given_Wh:.0f} Wh of heat were given within an hour, above the limit of {max_Wh_per_h:g} Wh"

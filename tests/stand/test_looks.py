@@ -54,13 +54,13 @@ def noise_K(time_s: float) -> float:
 class Feed:
     """A rule over a hub that is polled; `run` gives when it first objects, s, and None when it does not."""
 
-    def __init__(self, rule: Rule) -> None:
-        self.rule, self.hub, self.time_s = rule, Hub(), 0
+    def __init__(self, rule: Rule, poll_s: int = POLL_S) -> None:
+        self.rule, self.hub, self.time_s, self.poll_s = rule, Hub(), 0, poll_s
 
     def run(self, duration_s: int, **changing: Callable[[float], float]) -> int | None:
         """`changing`: device_quantity -> its value so many s after the begin of this run; the rest is at rest."""
         begun_s = self.time_s
-        for since_s in range(0, duration_s, POLL_S):
+        for since_s in range(0, duration_s, self.poll_s):
             self.time_s = begun_s + since_s
             values = AT_REST | {name.replace("_", ".", 1): value(since_s) for name, value in changing.items()}
             time_ns = to_ns(self.time_s)
@@ -73,7 +73,7 @@ class Feed:
             self.hub.publish(Batch("stand", time_ns, readings))
             if self.rule(self.hub, time_ns) is not None:
                 return since_s
-        self.time_s += POLL_S
+        self.time_s += self.poll_s
         return None
 
 
@@ -129,6 +129,13 @@ def test_more_heat_within_an_hour_than_the_chamber_ever_needs():
     full_s = feed.run(7200, regulator_mv_heat=constant(100.0))
     assert full_s is not None
     assert abs(full_s - 1400 / 2000 * 3600) <= 60
+
+
+def test_an_hour_of_heat_is_an_hour_however_often_it_is_looked_at():
+    for poll_s in (1, 7, 50):
+        feed = Feed(limit_heat_energy(1400, 2000, "regulator", PERMIT), poll_s)
+        assert feed.run(4 * 3600, regulator_mv_heat=constant(69.5)) is None  # 1,390 Wh
+        assert feed.run(4 * 3600, regulator_mv_heat=constant(75.0)) is not None
 
 
 def test_a_probe_that_falls_or_stays_while_the_regulator_heats():
