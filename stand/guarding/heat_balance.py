@@ -33,8 +33,8 @@ def compute_heat_percent(readings: Readings, regulator: str, permit: str) -> flo
 
 @dataclass(frozen=True, slots=True)
 class HeatTotal:
-    """Heat of the minutes that are over, (begin ns, Wh), oldest first, and of the one since `begun_ns`; each ends at the
-    first look after 60 s, and may be longer."""
+    """Heat of the minutes that are over, (begin ns, Wh), oldest first, and of the one since `begun_ns`; each ends at
+    the first look after 60 s, and may be longer."""
 
     begun_ns: int
     looked_ns: int
