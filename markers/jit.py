@@ -1,20 +1,24 @@
-"""Functions compiled to machine code. What is called from Python is compiled once per machine and kept next to the
-source, or in the user's cache where the installation is read-only (numba's own rule; NUMBA_CACHE_DIR names another
-place)."""
+"""Functions compiled to machine code. What is called from Python is compiled once per machine and kept: of an
+installation in the user's cache, $XDG_CACHE_HOME/thermostand/machine-code or ~/.cache, since an installer removes only
+what it has installed; of a clone next to the source, with which it goes. NUMBA_CACHE_DIR names another place."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config
 from numba.extending import register_jitable
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_SETTINGS: Any = config  # its names are made when it is loaded
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
@@ -40,10 +44,33 @@ def compile_entry(function: Function) -> Function:
     Kept code is thrown away when the function's own file changes, or a variable of the function around it: `digest` of
     the modules that are compiled into it belongs there.
     """
+    return compile_with(**_OPTIONS)(function)
+
+
+def compile_with(**options: Any) -> Callable[[Function], Function]:
+    """Make the decorator that compiles a function with these options of numba's, and keeps it as `compile_entry`."""
+
+    def decorate(function: Function) -> Function:
+        try:
+            with _choose_place(function):
+                return cast(Function, numba.njit(cache=True, **options)(function))
+        except RuntimeError:  # no locator available: nothing on this machine can be written to
+            return cast(Function, numba.njit(**options)(function))
+
+    return decorate
+
+
+@contextmanager
+def _choose_place(function: Callable[..., Any]) -> Generator[None]:
+    """Inside, numba keeps the code of this function where it belongs: it chooses when a function is decorated."""
+    given = _SETTINGS.CACHE_DIR
+    if not given and {"site-packages", "dist-packages"} & set(Path(function.__code__.co_filename).parts):
+        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        _SETTINGS.CACHE_DIR = str(Path(home) / "thermostand" / "machine-code")
     try:
-        return cast(Function, numba.njit(cache=True, **_OPTIONS)(function))
-    except RuntimeError:  # no locator available: nothing on this machine can be written to
-        return cast(Function, numba.njit(**_OPTIONS)(function))
+        yield
+    finally:
+        _SETTINGS.CACHE_DIR = given
 
 
 def compute_digest(*modules: ModuleType) -> str:

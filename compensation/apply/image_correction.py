@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from thermostand.compensation.drift_runtime import source_offset
 from thermostand.compensation.history.thermal_history import Float, States
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.files import write_bytes_atomically
+from thermostand.markers.jit import compile_with
 
 # Reading an image at places between its pixels, in float32, fast enough for a camera's stream.
 #
@@ -136,7 +136,7 @@ class _Buffers(NamedTuple):
     held: Float32
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@compile_with(nogil=True, fastmath=True)
 def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, out: Float32) -> None:
     """Strip by strip; bands of source rows that were read along x are held until others need their place. from_x: of
     the source's rows, from_y: of the result's."""
@@ -170,7 +170,7 @@ def _resample(image: Image, from_x: Float32, from_y: Float32, table: Float32, ou
                 out[_AT(y), _AT(left) + x] = line[x]
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@compile_with(nogil=True, fastmath=True)
 def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: Float32, buffers: _Buffers) -> None:
     """BLOCK_px rows of the source, in a strip, at the places that the result asks for."""
     whole, weights, row, cells = buffers.whole, buffers.weights, buffers.row, strip.cells
@@ -197,7 +197,7 @@ def _read_band(image: Image, band: int, from_x: Float32, strip: _Cells, table: F
             begin = end
 
 
-@nb.njit(cache=True, nogil=True)
+@compile_with(nogil=True)
 def _find_run_end(whole: Int64, begin: int, cells: int) -> int:
     """The first cell after `begin` that reads other whole pixels, `cells` at most."""
     end = begin + 1
@@ -206,7 +206,7 @@ def _find_run_end(whole: Int64, begin: int, cells: int) -> int:
     return end
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@compile_with(nogil=True, fastmath=True)
 def _weigh(upper: Float32, lower: Float32, strip: _Cells, table: Float32, whole: Int64, weights: Float32) -> None:
     """Compute the whole pixels of each cell of a strip's row, whose corners have the offsets `upper` and `lower`, and
     for each column of pixels the weights in its first row (TAPS, pixels) and their change per row."""
@@ -235,7 +235,7 @@ def _weigh(upper: Float32, lower: Float32, strip: _Cells, table: Float32, whole:
                 weights[k + _AT(TAPS), left + x] = growth + np.float32(x) * growth_change
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@compile_with(nogil=True, fastmath=True)
 def _set_weights(table: Float32, place: np.float32, weights: Float32, row: np.uint64) -> None:
     """Set a row of `weights` to those of one place."""
     at = (place + np.float32(_REACH)) * _PER_NODE
@@ -245,14 +245,14 @@ def _set_weights(table: Float32, place: np.float32, weights: Float32, row: np.ui
         weights[row, k] = table[node, k] + part * (table[node + _AT(1), k] - table[node, k])
 
 
-@nb.njit(cache=True, nogil=True)
+@compile_with(nogil=True)
 def _mirror_index(place: int, size: int) -> int:
     """The row or column of the image that stands for one beyond it."""
     place = abs(place)
     return min(max(place if place < size else 2 * (size - 1) - place, 0), size - 1)
 
 
-@nb.njit(cache=True, nogil=True)
+@compile_with(nogil=True)
 def _copy_row(image: Image, y: int, begin: int, count: int, row: Float32) -> None:
     """Copy `count` columns of a row of the image, from `begin` on, mirrored at its ends."""
     width = image.shape[1]
@@ -266,7 +266,7 @@ def _copy_row(image: Image, y: int, begin: int, count: int, row: Float32) -> Non
         row[x] = image[y, _mirror_index(begin + x, width)]
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@compile_with(nogil=True, fastmath=True)
 def _filter_along_x(row: Float32, shift: int, weights: Float32, down: np.float32, run: _Cells, line: Float32) -> None:
     """Pixels of a source row into their place in a held line, `down` rows below their cells' first one. Weights are
     named one by one: the processor then takes many pixels at once."""
@@ -286,7 +286,7 @@ def _filter_along_x(row: Float32, shift: int, weights: Float32, down: np.float32
         )
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@compile_with(nogil=True, fastmath=True)
 def _filter_along_y(held: Float32, top: int, weights: Float32, down: np.float32, run: _Cells, line: Float32) -> None:
     """Pixels of a row of the result, from the 8 held rows that begin with `top`."""
     w, d = weights[:TAPS], weights[TAPS:]

@@ -23,7 +23,7 @@ _OWN_NAMES = {STOP: "stop", "reset": "clear_errors"}  # that SECoP has itself; a
 
 # SECoP's data types, as far as this node has them.
 _TEXT: DataInfo = {"type": "string", "isUTF8": True}
-_WHOLE: DataInfo = {"type": "int", "min": 0, "max": 1 << 31}
+_WHOLE: DataInfo = {"type": "int", "min": 0, "max": (1 << 31) - 1}  # of 32 bits: what EPICS takes for a limit
 _FLAG: DataInfo = {"type": "bool"}
 _PHASES: DataInfo = {"type": "enum", "members": {"idle": 0, "running": 1, "held": 2, "stopping": 3}}
 _PLACES: DataInfo = {"type": "enum", "members": {"closed": 0, "open": 1}}

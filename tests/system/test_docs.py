@@ -38,7 +38,7 @@ DOCS = ROOT / "docs"
 EXAMPLES = DOCS / "examples"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.parent.name != "adr" and EXAMPLES not in page.parents)
 PROGRAMS = {"stand": stand, "compensate": compensate}
-OTHERS = {"arv-tool-0.8", "cc", "colcon", "cp", "pip", "ros2", "ssh", "systemctl"}
+OTHERS = {"arv-tool-0.8", "cc", "colcon", "cp", "pip", "pipx", "ros2", "ssh", "systemctl", "uv"}
 """Programs that are not ours: what is typed for them is not tried."""
 NOT_OURS = {"nginx", "matlab", "text", "math"}
 """Blocks of these are for other programs, or shown only; equations are drawn by the site's test."""
