@@ -366,6 +366,17 @@ def observations_of(
         The covariance of each centre.
     image_size : (width, height), optional
         In px. By default it is what holds the centres.
+    target : Target, optional
+        The target. By default one without a name, of as many markers, stands for it.
+    camera_serial : str
+        The camera's serial number; sessions of another one are refused.
+    name : str
+        The session's id, in messages and reports.
+
+    Returns
+    -------
+    Observations
+        One session of frames, as `fit` takes them.
 
     Raises
     ------

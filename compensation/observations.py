@@ -289,6 +289,11 @@ def observe(
     camera : str, optional
         The name of the camera, in sessions of several. By default the leading one is taken.
 
+    Returns
+    -------
+    Observations
+        The frames with their centres, covariances and temperatures.
+
     Raises
     ------
     SessionError

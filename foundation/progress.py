@@ -30,7 +30,20 @@ class Report(Protocol):
 
 @contextmanager
 def progress(title: str, total: float) -> Generator[Report]:
-    """Show progress of `title` on standard error while inside; `total` in any unit."""
+    """Show progress on standard error while inside.
+
+    Parameters
+    ----------
+    title
+        What goes on.
+    total
+        How much there is to do, in any unit.
+
+    Yields
+    ------
+    Report
+        Is called with how much is done, in that unit, and a text.
+    """
     if get_output().quiet:
         yield lambda done, text: None
     elif sys.stderr.isatty():

@@ -416,6 +416,11 @@ def detect(
     watch : callable
         Gets the part of a search that is done, 0 to 1.
 
+    Returns
+    -------
+    Detection
+        The markers, with their centres and covariances.
+
     Raises
     ------
     DetectionError

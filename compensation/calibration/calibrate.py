@@ -226,6 +226,11 @@ def calibrate(
     model : Model
         The pinhole. With AUTO held-out positions decide.
 
+    Returns
+    -------
+    CameraCalibration
+        Pinhole and rays, their scores and uncertainty.
+
     Raises
     ------
     CalibrationError

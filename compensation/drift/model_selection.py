@@ -132,9 +132,10 @@ def select_better(paper: PaperModel, thermal: ThermalModel) -> DriftModel:
 
 
 def _is_better_predictor(paper: Candidate, thermal: Candidate) -> bool:
-    """By more than anybody measures, at set-points between others, and as much on the way and after switching on, where
-    frames of these were recorded: who records them will ask about them. That the paper's form needs no history does
-    not weigh against its prediction: it is in the file in any case, and `apply` takes it where there is none."""
+    """Return whether the thermal form predicts better than the paper's by more than anybody measures, at set-points
+    between others, and as much on the way and after switching on, where frames of these were recorded: who records them
+    will ask about them. That the paper's form needs no history does not weigh against its prediction: it is in the file
+    in any case, and `apply` takes it where there is none."""
     squares = [[float(one.squares_between.mean())] for one in (paper, thermal)]
     if paper.moving_rms_px is not None and thermal.moving_rms_px is not None:
         # At rest the paper's form was chosen for 2 of 24 drawn cameras by 0.1 mpx, where it left 33 and 74 mpx after

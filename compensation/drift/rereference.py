@@ -133,6 +133,11 @@ def rereference(model: DriftModel, observations: Observations, frames: Mask | No
         The frames to use, by default the session's REFERENCE frames. Where they were taken in another thermal state
         than the model's reference, that is taken into account.
 
+    Returns
+    -------
+    ThermalModel
+        The model, referred to where the target stands in the new session.
+
     Raises
     ------
     SessionError

@@ -117,6 +117,11 @@ def finder(workers: int = 1, cluster: str | None = None, *, use_cache: bool = Tr
     use_cache : bool
         Keep the markers found, and reuse those kept.
 
+    Returns
+    -------
+    Finder
+        What `observe` takes to find markers.
+
     Raises
     ------
     ConfigError

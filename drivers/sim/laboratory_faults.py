@@ -549,7 +549,7 @@ class FaultSchedule:
             self._laboratory.advance(now_ns)
 
     def tick(self) -> None:
-        """In real time, make what has become due happen; ConfigError when this laboratory cannot have it."""
+        """Make what has become due happen, in real time; ConfigError when this laboratory cannot have it."""
         if not self._laboratory.is_virtual:
             with self._lock:
                 self._break_until(self._laboratory.now_ns)

@@ -84,7 +84,7 @@ def import_mcap(path: Path, out: Path, report: Callable[[float, str], None]) -> 
 
 
 def _list_topics(found: McapContents) -> dict[str, tuple[Topic, ...]]:
-    """Those of the two series; SessionError for one that no recording has."""
+    """List the topics of the two series; SessionError for one that no recording has."""
     topics: dict[str, dict[str, Topic]] = {TELEMETRY: {}, FRAMES: {}}
     for number, channel in found.channels.items():
         form = find_batch_schema(channel)

@@ -88,7 +88,7 @@ class ContentDigest:
         self.counts[self._topics[channel]] += 1
 
     def hexdigest(self) -> str:
-        """Of all messages so far."""
+        """The digest of all messages so far."""
         return format_digest(self._sum)
 
 
@@ -129,12 +129,12 @@ class McapContents:
 
     @cached_property
     def first_ns(self) -> int:
-        """Of the log times; 0 without a message."""
+        """The first of the log times; 0 without a message."""
         return min(self.time_ns_of, default=0)
 
     @cached_property
     def last_ns(self) -> int:
-        """Of the log times; 0 without a message."""
+        """The last of the log times; 0 without a message."""
         return max(self.time_ns_of, default=0)
 
     def __len__(self) -> int:

@@ -415,6 +415,11 @@ def open_whole(path: Path | str, incomplete: Say | None = None) -> Session:
     incomplete : callable, optional
         Accept a session that is not whole; it gets the sentence that says what is missing.
 
+    Returns
+    -------
+    Session
+        The session, read from its folder.
+
     Raises
     ------
     SessionError

@@ -151,7 +151,7 @@ def _list_spans(
 
 
 def _thin(course: Course) -> Course:
-    """At most some hundred points, those where the set-point changes among them."""
+    """Choose at most some hundred points, those where the set-point changes among them."""
     count = len(course.times_s)
     every = max(1, math.ceil(count / _MOST_POINTS))
     points = course.set_point_degC

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import inspect
 import json
 import math
 import os
@@ -45,6 +46,23 @@ def test_what_the_notebook_page_shows_runs(recorded: Recorded, tmp_path: Path, m
     assert len(names["settled"]) == 4  # type: ignore[arg-type]
     assert max(names["evaluation"].rms_after_px) < 0.012  # type: ignore[attr-defined]
     assert names["found"].found == 54  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", [name for name in dir(thermostand) if inspect.isfunction(getattr(thermostand, name))])
+def test_a_public_function_documents_each_parameter_and_what_it_gives(name: str):
+    """In numpydoc form, which the site shows; what only writes a file gives nothing."""
+    function = getattr(thermostand, name)
+    document = inspect.getdoc(function) or ""
+    sections = re.split(r"\n\n(\w+)\n-+\n", document)
+    parts = dict(zip(sections[1::2], sections[2::2], strict=True))
+    listed = {
+        each
+        for line in re.findall(r"^(\w.*?)(?: :.*)?$", parts["Parameters"], re.MULTILINE)
+        for each in line.split(", ")
+    }
+    assert set(inspect.signature(function).parameters) <= listed
+    gives = str(inspect.signature(function).return_annotation) != "None"
+    assert not gives or parts.keys() & {"Returns", "Yields"}
 
 
 @pytest.mark.parametrize("package", [recording, markers, compensation, thermostand])

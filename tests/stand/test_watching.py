@@ -109,7 +109,7 @@ async def test_each_warning_says_what_to_type(tmp_path: Path):
         ("guard.not_recorded", {"action": "hold", "ends_itself": True}, "by itself"),
         ("prompt", {}, "`stand continue`"),
         ("disk_nearly_full", {}, "`stand session archive`"),
-        ("idle_log_not_recorded", {}, "see that the disk has room"),
+        ("idle_log_not_recorded", {}, "see that the disk has space"),
         ("flap_not_shut", {}, "close it by hand"),
         ("of a later version", {}, "`stand status`"),
     ],
