@@ -5,19 +5,23 @@
     arrays.telemetry["thermometers.air"]
 
 Opening reads the tables of frames only. An image is one chunk of a dask array, and what is cut out of it is all that
-stays in memory. Readings are decoded when the first of them is asked for. It takes the extra `arrays`.
+stays in memory, once: such a part of several frames is not to be written to, its `.copy()` is. Readings are decoded
+when the first of them is asked for. It takes the extra `arrays`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, Protocol, cast
+from weakref import WeakValueDictionary
 
 import numpy as np
 from dask.array.core import from_array
+from dask.array.dispatch import concatenate_lookup
 from dask.base import tokenize
 from numpy.typing import NDArray
 from xarray import Dataset
@@ -207,6 +211,8 @@ class _Images:
         self.shape = (len(places), meta.height, meta.width)
         self.dtype = np.dtype(np.uint8 if meta.significant_bits <= 8 else np.uint16)
         self.ndim = 3
+        self._results: WeakValueDictionary[str, _Result] = WeakValueDictionary()
+        self._lock = Lock()
 
     def __getitem__(self, cut: tuple[int | slice, int | slice, int | slice]) -> NDArray[np.generic]:
         """A copy, so that the rest of each image can go."""
@@ -215,7 +221,70 @@ class _Images:
             return np.array(_image(places)[within])
         if not places:
             return np.broadcast_to(np.zeros((), self.dtype), self.shape)[cut]
+        if len(places) == 1 and isinstance(cut[0], slice):
+            return self._put(range(len(self._places))[cut[0]].start, within, _image(places[0])[within])
         return np.stack([_image(place)[within] for place in places])
+
+    def _put(self, index: int, within: object, image: NDArray[np.generic]) -> NDArray[np.generic]:
+        """A copy of what was cut out of one frame, (1, rows, columns), where the copies of the others are, too."""
+        if image.nbytes * len(self._places) > _RESULT_LIMIT_BYTES:
+            return np.array(image)[np.newaxis]
+        with self._lock:
+            found = self._results.get(repr(within))
+            if found is None or found.is_taken[index]:  # by somebody who may still have it
+                shape = (len(self._places), *image.shape)
+                found = self._results[repr(within)] = _Result(np.empty(shape, image.dtype), np.zeros(shape[0], bool))
+            found.is_taken[index] = True
+        found.values[index] = image
+        piece = found.values[index : index + 1].view(_Piece)
+        piece.result, piece.index = found, index
+        return piece
+
+
+# dask keeps the pieces of a result until it has copied all of them: a region of 3,600 frames is in memory twice. So the
+# pieces are made where the result is to be, and are not copied again when all of it is asked for.
+
+_RESULT_LIMIT_BYTES = 1 << 28  # beyond it a result may not be wanted whole, as when each image is averaged
+
+
+@dataclass(eq=False)
+class _Result:
+    """Room for the same part of all frames, of which no page is in memory before it is written; which are taken."""
+
+    values: NDArray[Any]
+    is_taken: NDArray[np.bool_]
+
+
+class _Piece(np.ndarray[Any, Any]):
+    """A part of one frame in its place in a result; what numpy makes of it is in none."""
+
+    __array_priority__ = 1.0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType] as numpy has it
+    result: _Result | None = None
+    index = 0
+
+    def __array_finalize__(self, made_of: object) -> None:
+        self.result = None
+
+
+def _join(pieces: Sequence[NDArray[Any]], axis: int = 0) -> NDArray[Any]:
+    """The pieces as one array: not to be written to where it is no copy."""
+    if len(pieces) == 1:
+        return pieces[0]
+    first = pieces[0]
+    result = first.result if isinstance(first, _Piece) and axis == 0 else None
+    if result is not None and isinstance(first, _Piece):
+        in_order = (
+            isinstance(each, _Piece) and each.result is result and each.index == first.index + place
+            for place, each in enumerate(pieces)
+        )
+        if all(in_order):
+            joined = result.values[first.index : first.index + len(pieces)]
+            joined.flags.writeable = False  # somebody may have kept the pieces
+            return joined
+    return np.concatenate([np.asarray(each) for each in pieces], axis)
+
+
+concatenate_lookup.register(_Piece, _join)
 
 
 def _image(place: FramePlace) -> ImageArray:

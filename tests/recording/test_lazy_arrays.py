@@ -89,6 +89,31 @@ async def test_a_cut_reads_the_frames_it_needs_and_no_others(tmp_path: Path, mon
     assert len(decoded) == 3
 
 
+async def test_a_region_of_all_frames_is_in_memory_once(tmp_path: Path):
+    await record(tmp_path / "s", 8, items)
+    session = Session.open(tmp_path / "s")
+    region = session.to_xarray()["camera"].image[:, 3:9, 10:20]
+    expected = np.stack([each.image for each in session.frames()])[:, 3:9, 10:20]
+    kept = region.persist()
+    first, second, part = region.compute(), region.compute(), region[2:5].compute()
+    for found in (kept.compute(), first, second):
+        np.testing.assert_array_equal(found.values, expected)
+    np.testing.assert_array_equal(part.values, expected[2:5])
+    np.testing.assert_array_equal(region[::-2].values, expected[::-2])
+    np.testing.assert_array_equal(region.mean("time").values, expected.mean(0))
+    np.testing.assert_array_equal((region + 1).values, expected + 1)
+    np.testing.assert_array_equal(region.transpose("row", "time", "column").values, expected.transpose(1, 0, 2))
+    assert not np.shares_memory(first.values, second.values)
+    assert type(first.data) is np.ndarray
+    with pytest.raises(ValueError, match="read-only"):
+        first.values[0] = 0
+    first.copy().values[0] = 0
+    np.testing.assert_array_equal(first.values, expected)
+    blocks = kept.data.blocks[3].compute()
+    assert np.shares_memory(kept.compute().values, kept.compute().values), "nothing is copied"
+    np.testing.assert_array_equal(blocks, expected[3:4])
+
+
 async def test_cameras_are_apart_and_sizes_are_not_mixed(tmp_path: Path):
     def two(time_ns: int, index: int):
         yield frame(time_ns, index)
