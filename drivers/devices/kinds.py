@@ -31,7 +31,7 @@ from thermostand.foundation.readings import Channel, Reading
 
 _CHANNEL_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 GROUP = "thermostand.devices"
-ADDED = "devices"  # the section of a stand's file for the kinds of other packages
+ADDED = "devices"  # the section of a stand's file for kinds that are named there
 Work = Coroutine[None, None, object]
 Arguments = Mapping[str, float]
 OfSection = Callable[[str], Any]  # what a section of the stand's file has

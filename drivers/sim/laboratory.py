@@ -42,6 +42,7 @@ from thermostand.drivers.sim.units.regulator import FakeRegulator
 from thermostand.drivers.sim.units.relays import FakeRelays
 from thermostand.drivers.sim.units.thermal_imager import FakeThermalImager
 from thermostand.drivers.sim.units.thermometers import FakeThermometers, RtdModule
+from thermostand.drivers.sim.units.ups import FakeUps
 from thermostand.drivers.sim.wire import Engine, FaultyLink, LinkFaults, PtyWire, TcpWire
 from thermostand.foundation.addresses import parse_tcp_address
 from thermostand.foundation.clock import FollowedClock, WallClock
@@ -210,6 +211,11 @@ class Laboratory:
     def flap(self) -> FakeFlap:
         """The flap; ValueError when there is none."""
         return self._find_first(FakeFlap, "flap")
+
+    @property
+    def ups(self) -> FakeUps:
+        """The UPS; ValueError when there is none."""
+        return self._find_first(FakeUps, "UPS")
 
     @property
     def thermometer_modules(self) -> tuple[RtdModule, ...]:

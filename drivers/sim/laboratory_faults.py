@@ -98,6 +98,11 @@ def make_shown_word(path: str, word: str, text: str) -> Breakage:
     return Breakage(make_setter(path, lambda value: word if value else None), True, False, text)
 
 
+def make_held_word(path: str, worst: str, text: str) -> Breakage:
+    """One attribute of one fake is the word that is given, None once it is mended."""
+    return Breakage(make_setter(path, lambda value: None if value is None else str(value)), worst, None, text)
+
+
 @dataclass(frozen=True, slots=True)
 class Once:
     """Something that happens when the fault is set, and is not undone."""
@@ -400,6 +405,12 @@ FAULTS: dict[str, Breakage] = {
     ),
     "imager.again": make_flag("imager.again", "the last picture under new names"),
     "imager.unplugged": make_flag("imager.unplugged", "its folder is gone"),
+    # The UPS, and upsd.
+    "ups.mains_failed": make_flag("ups.mains_failed", "the mains have failed, and it is on battery"),
+    "ups.charge_percent": make_number_call("ups.set_charge", 25.0, "what is left in its battery"),
+    "ups.status": make_held_word("ups.status", "OB LB", "its status reads so"),
+    "ups.stale": make_flag("ups.stale", "upsd has no fresh data of it"),
+    "ups.driver_gone": make_flag("ups.driver_gone", "its driver is not connected to upsd"),
     # The camera that is named so, or the first.
     "camera.loss": make_amount("camera.faults.loss", 0.05, "share of stream packets lost"),
     "camera.burst": make_whole_number("camera.faults.burst", 20, 1, "packets lost in a row"),

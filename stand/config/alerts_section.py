@@ -9,7 +9,7 @@ from pydantic import Field
 
 from thermostand.foundation.documents import Document
 from thermostand.foundation.events import AlertCause
-from thermostand.stand.config.private_file import load_private_document
+from thermostand.foundation.private_file import load_private_document
 
 
 class AlertsConfig(Document):

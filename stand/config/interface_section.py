@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import make_durable_folder, sync_folder
-from thermostand.stand.config.private_file import load_private_document
+from thermostand.foundation.private_file import load_private_document
 
 TokenName = Annotated[str, Field(pattern=r"^[\w.@-]{1,64}$")]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:-]{1,253}$")]

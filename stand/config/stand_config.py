@@ -130,7 +130,8 @@ class RecordingConfig(Document):
 class StandConfig(Document):
     """The whole file. What holds the chamber's temperature is a regulator, a unit on the bus or (kind: software) ours,
     with a relay board that enables its heat, or a climate_chamber with a controller of its own, which needs none. Ours
-    heats by a relay of that board, or by a heat_module, an analog output. devices: of kinds that other packages add."""
+    heats by a relay of that board, or by a heat_module, an analog output. devices: each with its kind, ups or one that
+    another package adds."""
 
     name: Line = Field(min_length=1)
     operator: Line = ""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
+from thermostand.drivers.devices.ups import UpsSettings
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import CONNECTED, FRAMES_RESUMED, FRAMES_STOPPED, guard_rule
@@ -39,6 +40,7 @@ from thermostand.stand.guarding.interlocks import (
     require_regulator_running,
     require_session_folder,
 )
+from thermostand.stand.guarding.mains import watch_mains
 from thermostand.stand.guarding.plausibility import (
     FollowingBody,
     WarmAround,
@@ -248,6 +250,12 @@ def make_watches(config: StandConfig, announced: Announcements) -> tuple[Watch, 
         *_watch_operations(config, announced),
         *_watch_contacts(config),
         *_watch_dew(config),
+        *(
+            watch
+            for name, each in config.devices.items()
+            if isinstance(each, UpsSettings)
+            for watch in watch_mains(name, each)
+        ),
         *limit_watches(config.guard.channels),
         *(watch for name, each in config.guard.added.items() for watch in load_rule(name).watches(each, config)),
     )

@@ -193,10 +193,11 @@ class StandState(Value):
     seq: the sequence number of the stream that this state is after. version: of the program. phase: idle between runs.
     by_hand: heat that somebody ordered then. not_confirmed: what has not confirmed its safe state since a stop, a trip
     or the end of a run. reasons: what holds the run. readings: the last of every channel. setpoint_degC: of the
-    chamber, None when it is stopped or unknown. output_percent: of the regulator. flap: "open", "closed", "moving", or
-    "" when it is not known. axes: positions, mm or deg. counters: what wears, by name (compressor_hours, relay_cycles,
-    ...). moving: what is under way, as in `linear to 250 mm`. busy: the devices that carry out an order. drops: items
-    that the interface was too slow for. pausing: a pause comes when the step under way is done.
+    chamber, None when it is stopped or unknown. cameras: their names. output_percent: of the regulator. flap: "open",
+    "closed", "moving", or "" when it is not known. axes: positions, mm or deg. counters: what wears, by name
+    (compressor_hours, relay_cycles, ...). moving: what is under way, as in `linear to 250 mm`. busy: the devices that
+    carry out an order. drops: items that the interface was too slow for. pausing: a pause comes when the step under way
+    is done.
     """
 
     seq: int = 0
@@ -215,6 +216,7 @@ class StandState(Value):
     # Also what is merely under way, such as a flap that closes, so that "no failure yet" is not read as "safe".
     not_confirmed: tuple[NotConfirmed, ...] = ()
     readings: dict[str, ReadingState] = Field(default_factory=dict)
+    cameras: tuple[str, ...] = ()
     setpoint_degC: float | None = None
     output_percent: float | None = None
     heater_permitted: bool = False
@@ -412,6 +414,7 @@ def snapshot_state(config: StandConfig, stand: Stand, hub: Hub, clock: Clock) ->
         reasons=tuple(sorted(stand.gate.reasons)),
         not_confirmed=_list_not_confirmed(stand),
         readings={channel: _make_reading(reading) for channel, reading in readings.items()},
+        cameras=tuple(config.cameras),
         setpoint_degC=_get_value(readings.get("regulator.sp"))
         if _get_value(readings.get("regulator.running"))
         else None,

@@ -45,6 +45,7 @@ def laboratory(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Labor
         "fake": "probes.hart",
         "settings": {"protocol": "hart", "serial_number": None, "address": "tcp:127.0.0.1:0"},
     }
+    devices["ups"] = {"fake": "ups", "settings": {"ups": None, "address": "tcp:127.0.0.1:0"}}
     devices["linear"]["settings"]["address"] = f"serial:{tmp_path / 'linear'}"
     devices["camera"]["settings"]["address"] = allocate_camera_address()
     built = Laboratory(parse_document(json.dumps(described), LaboratorySpec, "laboratory"))

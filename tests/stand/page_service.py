@@ -65,7 +65,7 @@ class CycleService(FakeService):
         self.prompt: PromptState | None = None
         self.is_idle = False
         self.pausing = False
-        self.is_heat_permitted = True
+        self.is_heat_permitted = self.is_camera_on = True
         self.lost = ""  # a device that does not answer
         self.stops = 0
         self.viewing: PageData | None = None
@@ -120,7 +120,8 @@ class CycleService(FakeService):
                 "heater_permitted": self.is_heat_permitted and not self.tripped,
                 "compressor_on": bool(values.get("relays.compressor")),
                 "pausing": self.pausing,
-                "camera_on": True,
+                "camera_on": self.is_camera_on,
+                "cameras": ("camera",),
                 "flap": "closed",
                 "axes": {"linear": 135.0, "rotary": -15.0},
                 "counters": {"compressor_hours": 1204.5, "compressor_starts": 3110.0, "flap_cycles": 18220.0},

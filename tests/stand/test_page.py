@@ -13,7 +13,7 @@ from tests.stand.browser import PHONE, VIEWS, a_page, needs_chromium
 from tests.stand.page_service import frame_of, free_port, serve_cycle, target_image
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.items import Batch, StepMark, StepState
-from thermostand.foundation.readings import Reading
+from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.stand.safety.gate import CAMERA_LOST
 from thermostand.stand.serving.api_models import HeatByHand, NotConfirmed
 
@@ -80,6 +80,23 @@ async def test_what_a_device_measures_in_a_unit_of_its_own_has_a_row_and_a_curve
         await row.locator(".value", has_text="1013.20 hPa").wait_for()
         await page.locator(".curve[aria-label*='hPa'] canvas").wait_for()
         assert not await page.locator(".readings tr", has_text="lab wet").count()  # a flag has no curve
+
+
+async def test_a_thermometer_by_itself_is_no_camera_that_is_off(desk):
+    desk.is_camera_on, desk.lost = False, "camera"
+    async with a_page(desk.chromium, desk.port) as page:
+        now_ns = desk.clock.now_ns()
+        asked = page.expect_request(
+            lambda request: "/history" in request.url and "reference.temperature" in request.url
+        )
+        async with asked as found:
+            broken = bad_reading("reference.temperature", "degC", now_ns, "no reply", "wire")
+            desk.hub.publish(Batch("reference", now_ns, (broken,)))
+        assert "reference.drift_mean" not in (await found.value).url
+        assert "camera.drift_mean" in (await found.value).url
+        row = page.locator(".readings tr", has_text="reference temperature")
+        await row.locator(".value", has_text="no reading").wait_for()
+        await page.locator(".readings tr", has_text="camera").locator(".value", has_text="off").wait_for()
 
 
 async def test_heat_by_hand_is_seen_at_once_also_while_the_regulator_does_not_answer(desk):

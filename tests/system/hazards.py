@@ -224,6 +224,15 @@ HAZARDS = (
         ("system/test_added_channel.test_a_limit_is_set_on_it",),
     ),
     Hazard(
+        "work goes on until the battery is empty after the mains has failed",
+        "a camera, stages and a computer that lose power in the middle of a capture",
+        "lost session",
+        ("ups.*",),
+        ("mains_lost", "battery_low", "ups_silent"),
+        _NOTHING_HEATS + "; the relay board opens with its supply",
+        ("system/test_mains.test_the_run_ends_in_order_before_the_battery_does",),
+    ),
+    Hazard(
         "heat although a contact of the stand says no",
         "as the contact's maker says: door, water, cut-out",
         "damage",

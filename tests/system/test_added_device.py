@@ -12,7 +12,7 @@ import yaml
 from tests.addresses import find_free_port
 from tests.installed import install, see_it_everywhere
 from thermostand.drivers.devices.device_check import Finding
-from thermostand.drivers.devices.kinds import load_built_in_kinds
+from thermostand.drivers.devices.kinds import ADDED, load_built_in_kinds
 from thermostand.drivers.sim.fakes import FAKES, get_fake
 from thermostand.foundation.clock import VirtualClock
 from thermostand.foundation.documents import parse_document
@@ -61,9 +61,8 @@ def stand_with(**device: object) -> StandConfig:
 
 
 def test_each_kind_of_device_has_its_fake_and_each_fake_its_kind():
-    settings = {
-        kind.section: kind.fakes if kind.fakes is not None else (kind.section,) for kind in load_built_in_kinds()
-    }
+    named = [(kind.name if kind.section == ADDED else kind.section, kind) for kind in load_built_in_kinds()]
+    settings = {name: kind.fakes if kind.fakes is not None else (name,) for name, kind in named}
     settings["regulator"] = ("regulator",)  # of the two kinds in that section, one has nothing to be simulated
     get_fake("relays")
     assert sorted(FAKES) == sorted(key for keys in settings.values() for key in keys)

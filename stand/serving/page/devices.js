@@ -103,6 +103,6 @@ export class Devices {
 const name_of = (channel) => (channel.startsWith("thermometers.") || channel.startsWith("regulator.") ? look_of(channel).name.replace(/^regulator (?=[a-z])/, "") : words(channel.split(".")[1]));
 
 function value_of(channel, { value, unit }) {
-  const says = channel.startsWith("relays.") ? ["off", "on"] : /\.(running|fault|moving|homed)$/.test(channel) ? ["no", "yes"] : null;
+  const says = channel.startsWith("relays.") ? ["off", "on"] : /\.(running|fault|moving|homed|on_battery|low_battery)$/.test(channel) ? ["no", "yes"] : null;
   return (unit === "1" && says?.[value]) || `${number(value, Number.isInteger(value) ? 0 : 2)} ${unit_of(unit)}`;
 }

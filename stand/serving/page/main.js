@@ -25,7 +25,7 @@ const app = {
     return seconds(this.state.now_ns, this.state.utc_offset_ns) + (performance.now() - this.state_ms) / 1000;
   },
   cameras() {
-    return [...new Set(Object.keys(this.state?.readings ?? {}).filter((name) => name.endsWith(".temperature")).map((name) => name.split(".")[0]))];
+    return this.state?.cameras ?? [];
   },
 };
 const notices = new Notices(at("notices"), app);
