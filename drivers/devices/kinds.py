@@ -115,12 +115,13 @@ class ManualActions(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """What a person may tell a device between runs."""
+    """What a person may tell a device between runs. heats: only who commissions the stand may."""
 
     name: str
     text: str
     act: Callable[[ManualActions, str, Arguments], Work]
     arguments: Callable[[Any, OfSection], tuple[VerbNumber, ...]] = lambda settings, of_section: ()
+    heats: bool = False
 
 
 def _list_set_points(settings: object, of_section: OfSection) -> tuple[VerbNumber, ...]:
@@ -140,6 +141,7 @@ CONTROL = (
         "heat or cool to a set-point",
         lambda stand, _, given: stand.heat(given["setpoint_degC"]),
         _list_set_points,
+        heats=True,
     ),
     Verb("stop", "stop heating and cooling", lambda stand, name, given: stand.stop_heat()),
 )

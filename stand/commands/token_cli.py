@@ -27,43 +27,46 @@ _BYTES = 32
 def add(
     name: NameArgument,
     config: ConfigOption = "simulated",
-    read_only: Annotated[bool, typer.Option("--read-only", help="May look and press STOP, but order nothing.")] = False,
+    read_only: Annotated[bool, typer.Option("--read-only", help="The same as --role look.")] = False,
+    role: Annotated[
+        str, typer.Option(help="look: sees everything; operate: runs and devices; commission: also clears trips.")
+    ] = "commission",
 ) -> None:
     """Make a token and print it, once. A daemon that is already running knows it after SIGHUP, or its next start.
 
     Example: stand token add rose --config my-stand.yaml
     """
-    from thermostand.stand.config.interface_section import TokenFile, load_tokens, write_tokens
+    from thermostand.stand.config.interface_section import KEYS, ROLES, Role, TokenFile, load_tokens, write_tokens
 
     path = _get_token_file(config)
     known = load_tokens(path) if path.expanduser().exists() else TokenFile()
     if name in known.list_by_name():
         raise ConfigError(f"{path}: {name} has a token already; `stand token remove {name}` first")
     token = secrets.token_urlsafe(_BYTES)
-    kind = "read_only" if read_only else "tokens"
+    given = cast("Role", "look" if read_only else role)
+    if given not in ROLES:
+        raise ConfigError(f"--role: there is no role {role!r}; there are {', '.join(ROLES)}")
+    kind = KEYS[given]
     try:
         added = TokenFile.model_validate({**known.model_dump(), kind: {**getattr(known, kind), name: token}})
     except ValueError:
         raise ConfigError(f"{name!r}: a name has up to 64 letters, digits and . _ @ -") from None
     write_tokens(path, added)
-    show({"name": name, "token": token, "read_only": read_only}, [token])
+    show({"name": name, "token": token, "role": given}, [token])
     _print_activation("knows it")
 
 
 @app.command("list")
 def list_names(config: ConfigOption = "simulated") -> None:
-    """List who has a token, and who may only look.
+    """List who has a token, and its role.
 
     Example: stand token list --config my-stand.yaml
     """
     from thermostand.stand.config.interface_section import load_tokens
 
-    found = [
-        (name, read_only)
-        for name, (_, read_only) in sorted(load_tokens(_get_token_file(config)).list_by_name().items())
-    ]
-    lines = [f"{name}  read-only" if read_only else name for name, read_only in found]
-    show([{"name": name, "read_only": read_only} for name, read_only in found], lines)
+    known = load_tokens(_get_token_file(config)).list_by_name()
+    found = [(name, role) for name, (_, role) in sorted(known.items())]
+    show([{"name": name, "role": role} for name, role in found], [f"{name}  {role}" for name, role in found])
 
 
 @app.command()

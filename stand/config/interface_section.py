@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 
+from thermostand.foundation.addresses import IpAddress
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError
 from thermostand.foundation.files import make_durable_folder, sync_folder
@@ -17,6 +18,32 @@ from thermostand.foundation.private_file import load_private_document
 TokenName = Annotated[str, Field(pattern=r"^[\w.@-]{1,64}$")]
 HostName = Annotated[str, Field(pattern=r"^[A-Za-z0-9.:-]{1,253}$")]
 Token = Annotated[str, Field(pattern=r"^[!-~]{20,200}$")]
+
+
+Role = Literal["look", "operate", "commission"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""What somebody may do, each more than the one before. look: see everything. operate: runs, queue, devices by hand.
+commission: clear a trip, heat by hand. STOP needs none."""
+
+
+def may(role: Role, needed: Role) -> bool:
+    """Whether that role is enough."""
+    return ROLES.index(role) >= ROLES.index(needed)
+
+
+UserName = TokenName
+
+
+class SingleSignOnConfig(Document):
+    """A reverse proxy that has already asked who somebody is, and says so in a header. proxies: the addresses from
+    which that header counts; from any other it is as if it were not there. users: the role of each, by the name in the
+    header; others: of everybody else, none: they are let in by a token only. The proxy must remove the header
+    from what it is sent."""
+
+    header: str = Field(default="X-Remote-User", pattern=r"^[A-Za-z0-9-]{1,64}$")
+    proxies: tuple[IpAddress, ...] = Field(min_length=1, max_length=50)
+    users: dict[UserName, Role] = Field(default_factory=dict)
+    others: Role | None = None
 
 
 class InterfaceConfig(Document):
@@ -28,7 +55,7 @@ class InterfaceConfig(Document):
     answer SECoP on this machine, usually 10767, as with --secop; not at all without it. trust_loopback: who asks from
     this machine needs no token all the same, and may do everything (`true`), or only look and press STOP
     (`read-only`, also where no secrets are named); a proxy on this machine that adds no header makes everybody behind
-    it one who asks from this machine.
+    it one who asks from this machine. single_sign_on: a proxy that tells who asks.
     """
 
     trust_loopback: bool | Literal["read-only"] = False
@@ -36,27 +63,33 @@ class InterfaceConfig(Document):
     secrets: Path | None = None
     port: int | None = Field(default=None, ge=1, le=65535)
     secop_port: int | None = Field(default=None, ge=1, le=65535)
+    single_sign_on: SingleSignOnConfig | None = None
+
+
+KEYS: dict[Role, str] = {"commission": "tokens", "operate": "operate", "look": "read_only"}
+"""Where the file of tokens has those of a role."""
 
 
 class TokenFile(Document):
-    """The file that interface.secrets names: tokens, by the name of who has them. read_only: of those who may look and
-    press STOP, but order nothing."""
+    """The file that interface.secrets names: tokens, by the name of who has them, for each role: tokens (commission),
+    operate, read_only (look)."""
 
     tokens: dict[TokenName, Token] = Field(default_factory=dict)
+    operate: dict[TokenName, Token] = Field(default_factory=dict)
     read_only: dict[TokenName, Token] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_unique(self) -> TokenFile:
-        if self.tokens.keys() & self.read_only.keys():
+        pairs = [pair for of in (self.tokens, self.operate, self.read_only) for pair in of.items()]
+        if len(dict(pairs)) < len(pairs):
             raise ValueError("a name has one token")
-        if len({*self.tokens.values(), *self.read_only.values()}) < len(self.tokens) + len(self.read_only):
+        if len({token for _, token in pairs}) < len(pairs):
             raise ValueError("a token has one name")
         return self
 
-    def list_by_name(self) -> dict[str, tuple[str, bool]]:
-        """The token of each name, and whether it is read-only."""
-        writing = {name: (token, False) for name, token in self.tokens.items()}
-        return writing | {name: (token, True) for name, token in self.read_only.items()}
+    def list_by_name(self) -> dict[str, tuple[str, Role]]:
+        """The token of each name, and its role."""
+        return {name: (token, role) for role, key in KEYS.items() for name, token in dict(getattr(self, key)).items()}
 
     def drop_token(self, name: str) -> TokenFile:
         """The same but for the token of that name."""
@@ -67,7 +100,7 @@ class TokenFile(Document):
 
 def load_tokens(path: Path) -> TokenFile:
     """ConfigError as load_private_document."""
-    form = "`tokens:` and `read_only:`, with a token of at least 20 characters for each name, each name and token once"
+    form = "`tokens:`, `operate:` and `read_only:`, each name and token once, a token of at least 20 characters"
     return load_private_document(path, "interface.secrets", TokenFile, form)
 
 

@@ -13,7 +13,7 @@ from thermostand.drivers.devices.ups import CHARGE, LOW_BATTERY, ON_BATTERY, RUN
 from thermostand.foundation.clock import NS_PER_S, to_ns
 from thermostand.foundation.events import guard_rule
 from thermostand.foundation.instants import format_duration
-from thermostand.stand.fault import Fault, Readings, Rule, Watch, get_value
+from thermostand.stand.safety.fault import Fault, Readings, Rule, Watch, get_value
 
 MAINS_LOST = guard_rule("mains_lost", "the stand is on battery, or mains is back for too short a time")
 BATTERY_LOW = guard_rule(

@@ -16,6 +16,7 @@ from thermostand.experiments.steps import MoveTo, SetTemperature, Step, number_s
 from thermostand.foundation.errors import ConfigError, DeviceError
 from thermostand.foundation.items import Batch
 from thermostand.stand.assembly.assemble import Assembly
+from thermostand.stand.config.interface_section import Role
 from thermostand.stand.estimating.estimate import price_plan
 from thermostand.stand.serving.api_models import Argument, Conflict, DeviceState, DeviceVerb, Missing
 
@@ -130,7 +131,8 @@ class ManualControl:
 def _make_verb(verb: Verb, takes: Iterable[kinds.VerbNumber]) -> DeviceVerb:
     """Make the verb as it is published."""
     arguments = (Argument(name=name, unit=unit, minimum=low, maximum=high) for name, unit, low, high, _ in takes)
-    return DeviceVerb(verb=verb.name, text=verb.text, arguments=tuple(arguments))
+    role: Role = "commission" if verb.heats else "operate"
+    return DeviceVerb(verb=verb.name, text=verb.text, role=role, arguments=tuple(arguments))
 
 
 def _parse_number(value: object, name: str) -> float:

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field, JsonValue
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, SessionError
 from thermostand.recording.reading.notes import LONGEST_NOTE
+from thermostand.stand.config.interface_section import Role
 from thermostand.stand.safety.gate import ENDINGS, INTERLOCK, OPERATOR, Phase
 from thermostand.stand.serving.api_models import (
     LONGEST_RECIPE,
@@ -204,13 +205,22 @@ class StandService(Served):
 
         return await list_simulated_faults(self._assembly)
 
+    def find_role(self, name: str, given: Document | None) -> Role | None:
+        """That of the command, or of a device's verb."""
+        if not isinstance(given, DeviceRequest):
+            return super().find_role(name, given)
+        for verb in (verb for each in self.devices() if each.name == given.device for verb in each.verbs):
+            if verb.verb == given.verb:
+                return verb.role
+        return super().find_role(name, given)
+
     def make_answer(self, verb: str, text: str) -> CommandAnswer:
         """Make an answer with what holds the run now, and what is still under way."""
         stand = self._assembly.stand
         reasons, moving = tuple(sorted(stand.gate.reasons)), tuple(stand.motions.texts)
         return CommandAnswer(verb=verb, text=text, reasons=reasons, moving=moving)
 
-    @command("/run/stop", anywhere=True)
+    @command("/run/stop", anywhere=True, role=None)
     def stop(self, who: Requester) -> str:
         """Make the stand safe and end the run, as Ctrl-C does. Needs no token and no body, in every state, as often as
         you like.
@@ -244,7 +254,7 @@ class StandService(Served):
         self._require_run().end_pause()
         return describe_hold(self._assembly.stand.gate.reasons)
 
-    @command("/run/reset", verbs=())
+    @command("/run/reset", verbs=(), role="commission")
     def reset(self, who: Requester) -> str:
         """The cause of a trip has been removed: what is still wrong trips again. A halted queue continues."""
         host, orders = self.host, self.host.orders

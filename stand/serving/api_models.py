@@ -18,6 +18,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.readings import Cause, Quality, Reading
 from thermostand.recording.reading.notes import LONGEST_NOTE, TAG
+from thermostand.stand.config.interface_section import Role, may
 from thermostand.stand.estimating.course import Course
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
     from thermostand.stand.config.stand_config import StandConfig
 
 # socket: this machine's Unix socket. loopback: TCP on this machine. token: TCP with a token. network: TCP without one,
-# which STOP needs not. secop: SECoP on this machine. terminal: a signal or key.
-How = Literal["socket", "loopback", "token", "network", "secop", "terminal", "queue"]
+# which STOP needs not. proxy: whom a reverse proxy names. secop: SECoP on this machine. terminal: a signal, a key.
+How = Literal["socket", "loopback", "token", "proxy", "network", "secop", "terminal", "queue"]
 When = Literal["now", "step"]
 StepStanding = Literal["waiting", "under_way", "done", "skipped"]
 
@@ -40,6 +41,10 @@ class Missing(StandError):
     """What was asked for does not exist: a step, a queued run, a session, a device."""
 
 
+class Forbidden(StandError):
+    """Who asks has a role that is not enough."""
+
+
 class Value(BaseModel):
     """What all values here are: immutable, without infinities or NaN, which JSON does not have."""
 
@@ -47,12 +52,22 @@ class Value(BaseModel):
 
 
 class Requester(Value):
-    """Who asks. name: the user of the socket, else the name of the token; "" when it is not known. read_only: may look
-    and press STOP, but order nothing."""
+    """Who asks. name: the user of the socket or of a proxy, else the name of the token; "" when it is not known."""
 
     name: str
     how: How
-    read_only: bool = False
+    role: Role = "commission"
+
+    @property
+    def described(self) -> str:
+        """In a sentence."""
+        named = {"token": f"the token of {self.name}", "proxy": self.name}
+        return named.get(self.how, "this machine, without a token,")
+
+    def require(self, needed: Role, what: str) -> None:
+        """Forbidden unless the role is enough for it."""
+        if not may(self.role, needed):
+            raise Forbidden(f"{what} needs the role {needed}, and {self.described} has the role {self.role}")
 
 
 class RunStatus(Value):
@@ -353,10 +368,11 @@ class Argument(Value):
 
 
 class DeviceVerb(Value):
-    """A command that a device takes by hand between runs."""
+    """A command that a device takes by hand between runs. role: that it needs."""
 
     verb: str
     text: str
+    role: Role = "operate"
     arguments: tuple[Argument, ...] = ()
 
 

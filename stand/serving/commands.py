@@ -26,6 +26,7 @@ from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import StandError
 from thermostand.foundation.events import COMMAND
 from thermostand.foundation.hub import Hub
+from thermostand.stand.config.interface_section import Role
 from thermostand.stand.serving.api_models import (
     CommandAnswer,
     DeviceState,
@@ -70,6 +71,7 @@ class _Mark:
     title: str
     anywhere: bool
     by_secop: str | None
+    role: Role | None
 
 
 def command(
@@ -81,6 +83,7 @@ def command(
     title: str = "",
     anywhere: bool = False,
     by_secop: str | None = "",
+    role: Role | None = "operate",
 ) -> Callable[[Method], Method]:
     """A method is a command, at this path below /api/v1, in which {name} is a field of its argument.
 
@@ -89,10 +92,11 @@ def command(
     such as `queue move`; its name where none is given, () for none that only sends. title: what a button for it is
     called, its name where none is given. anywhere: its verb finds the only stand of this machine. by_secop: the field
     that SECoP's command takes, "" for the only one that is required, None for no such command.
+    role: that it needs, None for nobody's.
     """
 
     def mark(method: Method) -> Method:
-        setattr(method, _MARK, _Mark(path, http, status, verbs, title, anywhere, by_secop))
+        setattr(method, _MARK, _Mark(path, http, status, verbs, title, anywhere, by_secop, role))
         return method
 
     return mark
@@ -195,11 +199,17 @@ class Served(ABC):
     def make_answer(self, verb: str, text: str) -> CommandAnswer:
         """The answer to a command of which that sentence came."""
 
+    def find_role(self, name: str, given: Document | None) -> Role | None:
+        """Which role a command needs with that argument; None for nobody's."""
+        return self.commands[name].role
+
     def perform(self, name: str, who: Requester, given: Document | None = None) -> BaseModel | Awaitable[BaseModel]:
         """Do a command, and record who asked for it and what came of it; raises what it raises. One that awaits
         nothing, as STOP, is done when this returns."""
         found = self.commands[name]
         try:
+            if (role := self.find_role(name, given)) is not None:
+                who.require(role, describe_command(name, summarize_argument(given)))
             came = getattr(self, found.method)(who, *(() if found.argument is None else (given,)))
         except StandError as error:
             self.publish_command(who, name, given, f"refused: {error}")

@@ -32,7 +32,10 @@ def make_interface(
     secop = settings.secop_port if secop is None else secop
     book = TokenStore(None if settings.secrets is None else load_tokens(settings.secrets))
     doors = () if secop is None else (make_secop_listener(secop, read_only=trusts == "read-only"),)
-    found = Interface(sessions, host, port, book, settings.hosts, trusts_loopback=trusts, doors=doors)
+    sign_on = settings.single_sign_on
+    found = Interface(
+        sessions, host, port, book, settings.hosts, trusts_loopback=trusts, doors=doors, single_sign_on=sign_on
+    )
     found.check()
     check_ports(found)
     return found

@@ -96,7 +96,7 @@ async def test_the_check_names_a_silent_one_and_what_its_status_says(bench: Benc
     found.clear()
     bench.fake.driver_gone = True
     await KIND.check(check)
-    assert look() == [("link", "failed", "its driver is not connected to upsd")]
+    assert look() == [("reading", "failed", "its driver is not connected to upsd")]
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ class CycleService(FakeService):
                 kind="regulator",
                 channels=("regulator.pv", "regulator.sp", "regulator.mv_heat"),
                 verbs=(
-                    DeviceVerb(verb="set", text="Hold this temperature", arguments=(warm,)),
+                    DeviceVerb(verb="set", text="Hold this temperature", role="commission", arguments=(warm,)),
                     DeviceVerb(verb="stop", text="Stop heating and cooling"),
                 ),
                 refused=refused,

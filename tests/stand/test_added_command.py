@@ -78,6 +78,7 @@ async def test_it_has_a_route_and_is_in_the_document_and_in_the_page_s_table(tmp
             "text": "Blow dry air.",
             "method": "POST",
             "path": "/api/v1/run/flush",
+            "role": "operate",
             "argument": FlushRequest.model_json_schema(),
         }
 

@@ -87,7 +87,10 @@ async def test_a_thermometer_by_itself_is_no_camera_that_is_off(desk):
     async with a_page(desk.chromium, desk.port) as page:
         now_ns = desk.clock.now_ns()
         asked = page.expect_request(
-            lambda request: "/history" in request.url and "reference.temperature" in request.url
+            lambda request: (
+                "/history" in request.url
+                and all(each in request.url for each in ("reference.temperature", "drift_mean"))
+            )
         )
         async with asked as found:
             broken = bad_reading("reference.temperature", "degC", now_ns, "no reply", "wire")

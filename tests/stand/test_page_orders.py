@@ -304,10 +304,29 @@ async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(desk
         assert await page.get_by_role("heading", name="Faults on purpose").count() == 0
 
 
+async def test_who_operates_may_not_clear_a_trip_nor_heat_by_hand_and_is_told_which_role_may(desk):
+    desk.is_idle = True
+    known = {"name": "ann", "how": "token", "role": "operate"}
+    async with a_page(desk.chromium, desk.port, "devices") as page:
+        await page.route("**/api/v1/who", lambda route: route.fulfill(json=known))
+        await page.reload()
+        heat = page.locator("[data-verb=set] button")
+        await page.locator("[data-verb=set] button:disabled").wait_for()
+        assert await heat.get_attribute("title") == (
+            "This needs the role commission. The token of ann has the role operate."
+        )
+        assert await page.locator("[data-verb=open] button").is_enabled()
+        desk.trip()
+        await page.get_by_role("button", name="Look at it and reset").click()
+        await page.get_by_role("button", name="The cause is removed").wait_for()
+        assert await page.get_by_role("button", name="The cause is removed").is_disabled()
+        assert await page.locator("#stop").is_enabled()
+
+
 async def test_who_may_only_look_gets_a_note_and_orders_nothing_but_stop(desk):
     async with a_page(desk.chromium, desk.port) as page:
         await page.get_by_text("Running", exact=True).wait_for()
-        known = {"name": "wall", "how": "token", "read_only": True}
+        known = {"name": "wall", "how": "token", "role": "look"}
         await page.route("**/api/v1/who", lambda route: route.fulfill(json=known))
         await page.reload()
         await page.get_by_text("The token of wall may look and press STOP").wait_for()

@@ -105,7 +105,7 @@ async def stays(viewer: ClientConnection, desk: FakeService) -> bool:
 async def test_a_token_that_may_only_look_says_so_stops_and_is_refused_by_its_name(tmp_path: Path):
     async with tokened(tmp_path) as stand:
         _, _, known = await stand.answered("GET", "/api/v1/who", LOOKS)
-        assert json.loads(known) == {"name": "wall", "how": "token", "read_only": True}
+        assert json.loads(known) == {"name": "wall", "how": "token", "role": "look"}
         status, _, answer = await stand.answered("POST", PAUSE, LOOKS)
         assert (status, "the token of wall" in json.loads(answer)["error"]) == (403, True)
         assert await stand.ask("POST", STOP_PATH, LOOKS) == 200

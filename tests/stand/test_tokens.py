@@ -41,7 +41,12 @@ def test_a_token_is_made_listed_known_and_taken_back(config: Path):
     assert invoke("add", "li.wei@home", "--config", config).exit_code == 0
     assert invoke("add", "wall", "--read-only", "--config", config).exit_code == 0
     assert "has a token already" in invoke("add", "wall", "--config", config).stderr
-    assert invoke("list", "--config", config).stdout == "li.wei@home\nrose\nwall  read-only\n"
+    assert invoke("add", "ann", "--role", "operate", "--config", config).exit_code == 0
+    assert load_tokens(path).list_by_name()["ann"][1] == "operate"
+    assert invoke("remove", "ann", "--config", config).exit_code == 0
+    unknown = invoke("add", "ann", "--role", "boss", "--config", config)
+    assert (unknown.exit_code, "look, operate, commission" in unknown.stderr) == (2, True)
+    assert invoke("list", "--config", config).stdout == "li.wei@home  commission\nrose  commission\nwall  look\n"
     removed = invoke("remove", "rose", "--config", config)
     assert (removed.exit_code, "SIGHUP" in removed.stderr) == (0, True)
     assert "has no token" in invoke("remove", "rose", "--config", config).stderr
@@ -65,6 +70,7 @@ def test_without_a_file_in_the_configuration_the_error_says_where_to_name_one():
         f"- {TOKEN}",
         f"tokens: {{rose: {TOKEN}}}\nread_only: {{rose: {TOKEN}s}}",
         f"tokens: {{rose: {TOKEN}}}\nread_only: {{wall: {TOKEN}}}",
+        f"tokens: {{rose: {TOKEN}}}\noperate: {{rose: {TOKEN}s}}",
         f"read_olny: {{wall: {TOKEN}}}",
     ],
 )

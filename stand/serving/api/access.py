@@ -5,7 +5,9 @@
 - Origin: what changes something, and the stream, is taken from the stand's own page or from what is no browser.
 - Token: for everything that does not come through the Unix socket, which proves who asks. Where the stand's file names
   no tokens, or trusts loopback, this machine needs none: a proxy on it that adds no header makes everybody local.
-- A read-only token may look: whatever is not asked by GET is refused, but for STOP and for what changes nothing.
+- Who has the role to look may look: whatever is not asked by GET is refused, but for STOP and for what changes nothing.
+  Which other role a command needs, the command says (serving/commands.py).
+- A proxy that the stand's file names may say in a header who asks.
 - STOP needs no token and is never delayed; it keeps the checks of Host and Origin.
 - A token that is taken back ends the streams that it has opened, and the logins that it was for.
 - Sizes and times of bodies are limited, and answers carry what a browser needs to be strict with them.
@@ -18,6 +20,7 @@ import hashlib
 import hmac
 import ipaddress
 import pwd
+import re
 import secrets
 import socket
 import struct
@@ -29,9 +32,9 @@ from http import HTTPStatus
 from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
-from thermostand.stand.config.interface_section import TokenFile
+from thermostand.stand.config.interface_section import Role, SingleSignOnConfig, TokenFile
 from thermostand.stand.serving.api.stream import make_json
-from thermostand.stand.serving.api_models import Requester
+from thermostand.stand.serving.api_models import Forbidden, Requester
 
 # The tokens of a stand as they are now: read at the start, and again when that is asked for.
 
@@ -77,6 +80,7 @@ _SESSION_S = 30 * 86400.0  # round number; nothing was measured
 _MOST_LOGINS = 100  # the oldest makes way; round number, nothing was measured
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _READS = frozenset({"GET", "HEAD", "OPTIONS"})
+_USER = re.compile(r"[\w.@-]{1,64}")
 _PEER = struct.Struct("3i")
 _PROXIED = frozenset({b"forwarded", b"x-forwarded-for", b"x-forwarded-host", b"x-real-ip", b"via"})
 
@@ -108,7 +112,7 @@ class _Login:
     """of: the token that has asked for it, None for none: then it was this machine's user."""
 
     who: Requester
-    of: tuple[str, bool] | None = field(repr=False)
+    of: tuple[str, Role] | None = field(repr=False)
     until_s: float
 
 
@@ -120,6 +124,7 @@ class Access:
     tokens: TokenStore = field(default_factory=TokenStore)
     hosts: Iterable[str] = ()
     trusts_loopback: bool | Literal["read-only"] = False
+    single_sign_on: SingleSignOnConfig | None = None
 
     def __post_init__(self) -> None:
         names = {socket.gethostname().lower(), *(host.lower() for host in self.hosts)}
@@ -128,13 +133,16 @@ class Access:
         self._logins: dict[str, _Login] = {}
 
     def make_login_code(self, who: Requester, *, read_only: bool = False) -> str:
-        """A code that opens the page once, within ten minutes, for who asks for it, or for one who may only look."""
+        """A code that opens the page once, within ten minutes, for who asks for it, or for one who may only look.
+        Forbidden for whom a proxy names: the cookie would outlast what the proxy knows."""
+        if who.how == "proxy":
+            raise Forbidden("who comes by single sign-on opens the page through the proxy; a login is for a token")
         now_s = time.monotonic()
         self._codes = {code: entry for code, entry in self._codes.items() if entry.until_s > now_s}
         while len(self._codes) >= _MOST_LOGINS:
             del self._codes[next(iter(self._codes))]
         code = secrets.token_urlsafe(24)
-        holder = Requester(name=who.name, how="token", read_only=who.read_only or read_only)
+        holder = Requester(name=who.name, how="token", role="look" if read_only else who.role)
         of = self._find_token(who.name) if who.how == "token" else None
         self._codes[_hash(code)] = _Login(holder, of, now_s + _LOGIN_S)
         return code
@@ -155,13 +163,17 @@ class Access:
         state, headers = cast("dict[str, Any]", scope.get("state") or {}), cast("Headers", scope["headers"])
         if state.get("door") == "socket":
             return Requester(name=get_user_name(state.get("uid")), how="socket")
-        found = self._identify_by_token(headers) or self._identify_by_cookie(headers)
+        is_proxy = self._is_proxy(scope)
+        found = self._identify_by_token(headers)
+        found = found or (self._identify_by_proxy(headers) if is_proxy else None) or self._identify_by_cookie(headers)
         if found is not None:
             return found
+        if is_proxy:  # whoever is behind it is not this machine
+            return None
         needs_token = self.tokens.known is not None and not self.trusts_loopback
         if needs_token or not _is_local(scope, headers):
             return None
-        return Requester(name="", how="loopback", read_only=self.trusts_loopback == "read-only")
+        return Requester(name="", how="loopback", role="look" if self.trusts_loopback == "read-only" else "commission")
 
     def admit(self, scope: Scope) -> Requester:
         """Return who asks, if the client may ask anything at all; Denied otherwise."""
@@ -169,8 +181,8 @@ class Access:
         who = self.identify(scope)
         if who is None and not is_exempt_from_token(scope["path"]):
             raise Denied(401, "this needs a token: an Authorization header, or the address of `stand token login`")
-        if who is not None and who.read_only and _may_change(scope):
-            raise Denied(403, f"{_describe_who(who)} may look and press STOP, but order nothing: it is read-only")
+        if who is not None and who.role == "look" and _may_change(scope):
+            raise Denied(403, f"{who.described} may look and press STOP, but order nothing: its role is look")
         return who or Requester(name="", how="network")
 
     def check(self, scope: Scope) -> None:
@@ -205,8 +217,8 @@ class Access:
         kind, _, token = given[0].partition(" ")
         found, known = _hash(token.strip()), self.tokens.known or TokenFile()
         matches = [
-            Requester(name=name, how="token", read_only=read_only)
-            for name, (each, read_only) in known.list_by_name().items()
+            Requester(name=name, how="token", role=role)
+            for name, (each, role) in known.list_by_name().items()
             if hmac.compare_digest(_hash(each), found)
         ]
         if len(given) > 1 or kind.lower() != "bearer" or not matches:
@@ -221,8 +233,25 @@ class Access:
     def _is_valid(self, login: _Login) -> bool:
         return time.monotonic() < login.until_s and login.of in (None, self._find_token(login.who.name))
 
-    def _find_token(self, name: str) -> tuple[str, bool] | None:
-        """Return the token of a name, and whether it is read-only."""
+    def _is_proxy(self, scope: Scope) -> bool:
+        """Whether it comes from a proxy that may say who asks."""
+        client = scope.get("client")
+        return bool(client and self.single_sign_on and str(client[0]) in self.single_sign_on.proxies)
+
+    def _identify_by_proxy(self, headers: Headers) -> Requester | None:
+        """The user that the proxy names; None when it names none, or one who has no role. Denied when it names two."""
+        settings = self.single_sign_on
+        names = [] if settings is None else _get_all(headers, settings.header.lower().encode())
+        if settings is None or not names:
+            return None
+        if len(names) > 1 or not _USER.fullmatch(names[0]):
+            raise Denied(401, f"the proxy's {settings.header} does not name one user")
+        known: dict[str, Role | None] = {**settings.users}
+        role = known.get(names[0], settings.others)
+        return None if role is None else Requester(name=names[0], how="proxy", role=role)
+
+    def _find_token(self, name: str) -> tuple[str, Role] | None:
+        """That of a name, and its role."""
         return (self.tokens.known or TokenFile()).list_by_name().get(name)
 
 
@@ -395,10 +424,6 @@ class _HeaderSender:
 
 def _may_change(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] not in _READS and scope["path"] not in _CHANGES_NOTHING
-
-
-def _describe_who(who: Requester) -> str:
-    return f"the token of {who.name}" if who.how == "token" else "this machine, without a token,"
 
 
 def _is_in_chunks(scope: Scope) -> bool:

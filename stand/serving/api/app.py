@@ -17,6 +17,7 @@ from starlette.routing import Match
 from thermostand.foundation.document_faults import format_path
 from thermostand.foundation.documents import Document
 from thermostand.foundation.errors import ConfigError, DeviceError, SessionError, StandError, StandTripped
+from thermostand.stand.config.interface_section import Role
 from thermostand.stand.serving.api.access import FAILED, Access, App, Gatekeeper
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
 from thermostand.stand.serving.api.listeners import Interface
@@ -26,6 +27,7 @@ from thermostand.stand.serving.api.stream import Stream, make_json
 from thermostand.stand.serving.api_models import (
     Conflict,
     DeviceState,
+    Forbidden,
     Missing,
     PlanCheck,
     PlanRequest,
@@ -45,14 +47,15 @@ _KEY = "idempotency_key"  # the header that does what a field `key` does
 
 
 class CommandInfo(BaseModel):
-    """A command: its name, what a button for it is called, what it does, how it is given, and the JSON Schema of what
-    it takes, {} for nothing."""
+    """A command: its name, what a button for it is called, what it does, how it is given, the role that it needs, null
+    for none, and the JSON Schema of what it takes, {} for nothing."""
 
     name: str
     title: str
     text: str
     method: str
     path: str
+    role: Role | None
     argument: dict[str, JsonValue]
 
 
@@ -68,6 +71,7 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
             response_model=each.answer,
             status_code=each.status,
             description=each.text,
+            openapi_extra={"x-role": each.role or "none"},
         )
 
     @router.get("/commands", response_model=list[CommandInfo])
@@ -80,6 +84,7 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
                 text=each.summary,
                 method=each.http,
                 path=f"{API}{each.path}",
+                role=each.role,
                 argument={} if each.argument is None else each.argument.model_json_schema(),
             )
             for each in bridge.commands.values()
@@ -185,6 +190,7 @@ def _make_list_response(values: Iterable[BaseModel]) -> Response:
 # What was raised -> the answer's status; the first that fits.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (Missing, 404),
+    (Forbidden, 403),
     (Conflict, 409),
     (StandTripped, 409),
     (ConfigError, 422),

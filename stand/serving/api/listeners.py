@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from thermostand.foundation.errors import ConfigError
+from thermostand.stand.config.interface_section import SingleSignOnConfig
 from thermostand.stand.serving.api.access import TokenStore, is_loopback
 from thermostand.stand.serving.api.bridge import Bridge
 
@@ -30,7 +31,7 @@ class Interface:
     """How a stand is reached besides its Unix socket.
 
     host, port: to listen at by TCP; no port, no TCP. hosts: names of this stand besides this machine's own.
-    trusts_loopback: as `trust_loopback` of the stand's file. doors: other protocols' ports. sessions: the folder of
+    trusts_loopback, single_sign_on: as in the stand's file. doors: other protocols' ports. sessions: the folder of
     recorded sessions. extra_routes: makes what else is served (history, frames, the page) in the thread, as routers, by
     the bridge.
     """
@@ -43,6 +44,7 @@ class Interface:
     trusts_loopback: bool | Literal["read-only"] = False
     doors: tuple[ProtocolListener, ...] = ()
     extra_routes: Sequence[Callable[[Bridge], Any]] = ()
+    single_sign_on: SingleSignOnConfig | None = None
 
     @property
     def url(self) -> str:

@@ -232,7 +232,7 @@ def _add_logins(router: APIRouter, access: Access, url: str) -> None:
 
     @router.get("/api/v1/who", response_model=Requester)
     async def who(request: Request) -> Response:
-        """Return as whom the stand knows you, and whether you may only look."""
+        """Return as whom the stand knows you, and your role."""
         return _make_response(request.state.who.model_dump_json())
 
     @router.post(INVITE_PATH, response_model=Invitation)

@@ -54,7 +54,7 @@ async def serve(
     try:
         doors.update(_open_tcp_sockets(interface))
         bridge = Bridge(service)
-        access = Access(interface.tokens, interface.hosts, interface.trusts_loopback)
+        access = Access(interface.tokens, interface.hosts, interface.trusts_loopback, interface.single_sign_on)
         stop = StopThread(bridge.request_stop, access, lambda error: report(INTERFACE_FAILED, _describe_failure(error)))
     except BaseException:
         for door in doors.values():

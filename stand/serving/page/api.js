@@ -35,6 +35,7 @@ export function commands() {
 
 // A button that is called as the service calls its command. `text`: with what else; `label`: for who does not see it.
 export function called(name, button, text = (title) => title, label = null) {
+  if (button.dataset.order === "") button.dataset.order = name;
   commands().then((known) => known.get(name).title, () => name).then((title) => {
     button.textContent = text(title);
     if (label) button.setAttribute("aria-label", label(title));

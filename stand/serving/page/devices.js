@@ -50,7 +50,7 @@ export class Devices {
       event.preventDefault();
       const given = Object.fromEntries(inputs.map(({ name, value }) => [name, value()]).filter(([, value]) => value !== undefined));
       order(answer, "device", { device: device.name, verb: verb.verb, arguments: given }, verb.text || words(verb.verb));
-    } }, inputs.map(({ label }) => label), h("button", { type: "submit", "data-order": "" }, verb.text || words(verb.verb)));
+    } }, inputs.map(({ label }) => label), h("button", { type: "submit", "data-order": "device", "data-role": verb.role }, verb.text || words(verb.verb)));
   }
 
   input(argument) {

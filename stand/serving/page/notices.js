@@ -136,7 +136,7 @@ export class Notices {
 
   halted(state) {
     const answer = h("p", { class: "answer", role: "status" });
-    const button = h("button", { type: "button", "data-order": "", onclick: () => order(answer, "reset", {}, "go on") }, "Go on with the queue");
+    const button = h("button", { type: "button", "data-order": "reset", onclick: () => order(answer, "reset", {}, "go on") }, "Go on with the queue");
     return { element: h("section", { class: "notice warning" }, h("h2", {}, "The queue is halted"), h("p", {}, state.queue_halted), h("div", { class: "row" }, button), answer) };
   }
 
