@@ -25,6 +25,9 @@ app = make_lazy_app(
         "datasheet": LazyCommand(
             "thermostand.compensation.commands.fit_cli", "Write a camera's thermal datasheet, with uncertainties."
         ),
+        "certificate": LazyCommand(
+            "thermostand.compensation.commands.certificate_cli", "Issue a calibration certificate: a page and a DCC."
+        ),
         "rereference": LazyCommand(_FIT, "Fit a model to where the target is in a new session."),
         "apply": LazyCommand(_APPLY, "Put points or images where they would have been at the reference temperature."),
         "export": LazyCommand(

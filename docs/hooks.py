@@ -39,6 +39,7 @@ FILES = {
     "geometry": ("geometry-file", "A stand's geometry"),
     "details": ("details-file", "Details of a measurement"),
     "mapping": ("mapping-file", "A mapping of a table"),
+    "order": ("order-file", "An order of a certificate"),
 }
 
 

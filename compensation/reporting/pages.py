@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.camera_file import CameraFile
+from thermostand.compensation.certificate.certificate import Certificate, Conformity
 from thermostand.compensation.datasheet.datasheet import COVERAGE, Datasheet, MeasuredQuantity
 from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.drift.evaluation import compute_improvement_percent
@@ -226,6 +227,7 @@ def _serialise_quantity(one: MeasuredQuantity) -> dict[str, object]:
             }
             for line in one.contributions
         ],
+        "correlations": [list(each) for each in one.correlations],
     }
 
 
@@ -249,6 +251,76 @@ def _format_utc_ns(ns: int) -> str:
 
 def _read_versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in _LIBRARIES}
+
+
+NOTES = (
+    "The results relate only to the item described above, as received and under the conditions stated.",
+    "This certificate is reproduced in full only, unless the laboratory that issued it approves otherwise in writing.",
+)
+
+
+def render_certificate_page(made: Certificate, equipment: Sequence[Line] = ()) -> str:
+    """Render the certificate as HTML text, which makes a PDF; the same data give the same text."""
+    return render_page(
+        "certificate",
+        "Calibration certificate",
+        made=made,
+        facts=list_certificate_facts(made),
+        groups=[(name, [*members]) for name, members in groupby(made.values, key=lambda one: one.quantity.group)],
+        decisions=[_format_decision(one) for one in made.conformities],
+        equipment=[*list_stated_details(made.sheet.details, made.sheet.observations.target), *equipment],
+        notes=NOTES,
+    )
+
+
+def list_certificate_facts(made: Certificate) -> list[Line]:
+    """What ISO/IEC 17025, 7.8.2, asks for, but for the results."""
+    order, item = made.order, made.order.item
+    first, last = made.performed
+    recorded = "" if made.laboratory_degC is None else "laboratory {:.1f} to {:.1f} °C, ".format(*made.laboratory_degC)
+    air = "air near the camera {:z.1f} to {:z.1f} °C".format(*made.sheet.air_degC)
+    versions = _read_versions()
+    return [
+        ("Laboratory", "; ".join(order.laboratory.lines)),
+        ("Customer", "; ".join(order.customer.lines)),
+        ("Item", f"{item.description}: {item.manufacturer} {item.model}, serial number {item.serial_number}"),
+        ("Lens", f"{item.lens}, serial number {item.lens_serial_number}"),
+        ("Condition as received", item.condition),
+        ("Received", order.received.isoformat()),
+        ("Calibrated", first.isoformat() if first == last else f"{first.isoformat()} to {last.isoformat()}"),
+        ("Issued", order.issued.isoformat()),
+        ("Method", order.method),
+        ("Conditions", f"{recorded}{air}; {order.conditions}"),
+        *((f"Traceability, {name}", text) for name, text in list_references(made)),
+        ("Records", "; ".join(_format_record(*each) for each in _list_records(made))),
+        ("Software", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        *([("Remarks", order.remarks)] if order.remarks else []),
+    ]
+
+
+def list_references(made: Certificate) -> list[Line]:
+    """The reference standards and the certificates that trace them to the SI."""
+    return [
+        (name, f"{one.identification}: certificate {one.certificate} of {one.issued_by}, {one.issued.isoformat()}")
+        for name, one in (("target", made.order.target), ("thermometers", made.order.thermometers))
+    ]
+
+
+def _list_records(made: Certificate) -> Iterator[tuple[str, str]]:
+    return ((one.session_id, one.digest) for one in made.sessions)
+
+
+def _format_record(session_id: str, digest: str) -> str:
+    return f"session {session_id}" + (f", SHA-256 of its manifest {digest}" if digest else "")
+
+
+def _format_decision(one: Conformity) -> list[str]:
+    quantity = one.value.quantity
+    limits = " to ".join(
+        ("−∞" if one.lower is None else f"{one.lower:g}", "∞" if one.upper is None else f"{one.upper:g}")
+    )
+    value = format_with_expanded_uncertainty(quantity.value, one.value.expanded)[0]
+    return [quantity.name, limits, value, format_significant(one.guard, 2), quantity.unit, one.verdict]
 
 
 def render_calibration_page(file: CameraFile, calibration: CameraCalibration) -> str:

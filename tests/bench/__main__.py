@@ -27,6 +27,7 @@ BENCHMARKS = (
         "drift",
         "coverage",
         "datasheet",
+        "certificate",
         "soaks",
     ),
     *("adaptive", "warp", "c_header", "pipeline", "cluster", "identification", "start", "stop", "page"),

@@ -114,7 +114,11 @@ def test_a_known_motion_is_found():
 def test_a_budget_adds_up_and_its_expanded_uncertainty_is_twice_the_root(sheet: Datasheet):
     for one in sheet.quantities:
         assert one.contributions, one.key
-        total = math.sqrt(sum((line.sensitivity * line.u) ** 2 for line in one.contributions))
+        amounts = {line.source: line.sensitivity * line.u for line in one.contributions}
+        total = math.sqrt(
+            sum(each**2 for each in amounts.values())
+            + sum(2 * r * amounts[first] * amounts[second] for first, second, r in one.correlations)
+        )
         assert one.u == pytest.approx(total)
         assert one.expanded == pytest.approx(2 * total)
         assert {line.kind for line in one.contributions} <= {"A", "B"}

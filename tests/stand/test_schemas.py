@@ -2,7 +2,7 @@
 
 import json
 import re
-from datetime import datetime
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ KINDS = {
     "targets": "target",
     "geometry": "geometry",
     "optics": "optics",
+    "orders": "order",
 }
 
 
@@ -40,7 +41,7 @@ def as_json(value: object) -> Any:
         return {str(key): as_json(each) for key, each in value.items()}
     if isinstance(value, list):
         return [as_json(each) for each in value]
-    return value.isoformat() if isinstance(value, datetime) else value
+    return value.isoformat() if isinstance(value, date) else value
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

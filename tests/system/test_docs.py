@@ -21,6 +21,7 @@ from typer.testing import CliRunner, Result
 from tests.addresses import find_free_port
 from tests.installed import install
 from tests.stand.fake_service import FakeService, serve_fake
+from thermostand.compensation.certificate.order import Order
 from thermostand.compensation.cli import app as compensate
 from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
 from thermostand.compensation.measurement_mapping import MeasurementMapping
@@ -146,6 +147,8 @@ def test_what_is_written_in_a_file_is_taken(block: Block):
         assert list(parse_document(block.text, Recipe, name).plan())
     elif "urls" in data:
         parse_document(block.text, AlertSecrets, name)
+    elif "customer" in data:
+        parse_document(block.text, Order, name)
     elif "lens" in data:
         parse_document(block.text, MeasurementDetails, name)
     elif "columns" in data:
