@@ -48,7 +48,7 @@ from .conftest import START_NS, Recorded, record_items
 from .drawn_cameras import Float, draw_camera
 from .drawn_sessions import make_full_session, record_session
 from .synthetic import observations
-from .test_datasheet import COEFFICIENTS, at_rest_per_K, recorded_night
+from .test_datasheet import COEFFICIENTS, at_rest_per_K, make_session
 
 EXAMPLE = Path(__file__).parents[2] / "configs" / "orders" / "example.yaml"
 DCC, SI = "{https://ptb.de/dcc}", "{https://ptb.de/si}"
@@ -187,7 +187,7 @@ def test_an_order_that_contradicts_the_sessions_is_refused(changes: dict[str, An
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_states_what_iso_17025_asks_for():
-    observed = recorded_night(2003, ("sag",), 1)
+    observed = make_session(2003, ("sag",), 1)
     order = Order.model_validate(stated(specification={"shift_J_per_K": {"upper": 0.1}}, replaces="EX-0000"))
     made = issue_certificate((), observed, order, None)
     page = render_certificate_page(made, [("Exposure", "100 ms")])
