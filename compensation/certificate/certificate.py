@@ -104,6 +104,8 @@ def issue_certificate(
         correction = correct_for_stand(sessions, observations, geometry)
         corrected = correction.observations
         sheet = add_stand_uncertainty(compute_datasheet(corrected, fit_model(corrected), order.details), correction)
+    if any(visits.by_camera for visits in sheet.visits):
+        raise SessionError("no air temperature near the camera was recorded; a drift per K of the air is not certified")
     certified = [one for one in sheet.quantities if not one.key.startswith(_OF_MODEL)]
     values = tuple(certify(one) for one in certified if math.isfinite(one.value) and one.u > 0)
     if not values:

@@ -185,6 +185,13 @@ def test_an_order_that_contradicts_the_sessions_is_refused(changes: dict[str, An
         issue_certificate((), observed, Order.model_validate(stated(**changes)), None)
 
 
+def test_without_the_air_s_temperature_nothing_is_certified():
+    observed = observations(lambda places, above_K: places + 0.01 * above_K, noise_px=1e-3)
+    blind = replace(observed, air_degC=np.full(len(observed.frame), np.nan))
+    with pytest.raises(SessionError, match="air"):
+        issue_certificate((), blind, Order.model_validate(stated(issued="2026-02-01")), None)
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_states_what_iso_17025_asks_for():
     observed = make_session(2003, ("sag",), 1)
