@@ -322,8 +322,8 @@ def stand(observed: Observations, tmp_path_factory: pytest.TempPathFactory) -> S
         readings = (Reading(f"thermometers.{one}", getattr(state, f"{one}_degC"), "degC", time_ns) for one in NAMES)
         yield Batch("thermometers", time_ns, tuple(readings))
 
-    path = tmp_path_factory.mktemp("sessions") / "night"
-    asyncio.run(record_items(path, items, len(observed.frame), 30, session_id="night", recipe="thermal-cycle"))
+    path = tmp_path_factory.mktemp("sessions") / "cycle"
+    asyncio.run(record_items(path, items, len(observed.frame), 30, session_id="cycle", recipe="thermal-cycle"))
     return Session.open(path)
 
 
