@@ -19,9 +19,8 @@ from thermostand.foundation.exit_codes import FAILED
 from thermostand.foundation.output import get_output, show
 from thermostand.foundation.usage import escape_line
 from thermostand.stand.commands.endpoint import ConfigOption
-from thermostand.stand.commissioning.commissioning import commission
+from thermostand.stand.commissioning.commissioning import CommissioningRecord, commission
 from thermostand.stand.commissioning.genicam_rehearsal import rehearse
-from thermostand.stand.commissioning.record import CommissioningRecord
 from thermostand.stand.config.stand_config import StandConfig, find_packaged, load_config
 from thermostand.stand.running.order import read_register_texts
 

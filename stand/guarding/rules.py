@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from thermostand.drivers.devices.regulators.software_regulator import SoftwareRegulatorSettings
 from thermostand.drivers.devices.ups import UpsSettings
 from thermostand.experiments.steps import Capture
 from thermostand.foundation.clock import NS_PER_S, to_ns
-from thermostand.foundation.events import CONNECTED, FRAMES_RESUMED, FRAMES_STOPPED, guard_rule
+from thermostand.foundation.events import CONNECTED, FRAMES_RESUMED, FRAMES_STOPPED, SENSOR, guard_rule
 from thermostand.foundation.items import Event, Item, StepMark, StepState
-from thermostand.stand.config.chamber_section import StartupResponseConfig
+from thermostand.stand.config.chamber_section import StartupResponseConfig, SteadyStatePowerConfig
 from thermostand.stand.config.dew import compute_dew_point_degC
 from thermostand.stand.config.guard_rule_plugins import load_rule
 from thermostand.stand.config.guard_section import ChannelLimits
@@ -50,13 +50,183 @@ from thermostand.stand.guarding.plausibility import (
     read_channels,
     require_cooling_response,
 )
-from thermostand.stand.guarding.sensor_diagnosis import SensorHistory, name_suspect
-from thermostand.stand.guarding.sensor_drift import limit_sensor_drift
-from thermostand.stand.guarding.steady_state_power import limit_output_deviation
+from thermostand.stand.guarding.sensor_diagnosis import SensorHistory, Suspicion, name_suspect
 from thermostand.stand.guarding.stuck_sensor import forbid_stuck_sensor, forbid_stuck_while_other_moves
 from thermostand.stand.guarding.thermal_crosscheck import crosscheck_by_camera, crosscheck_by_granite
 from thermostand.stand.safety.fault import DONE, Fault, Readings, Rule, Watch, get_value
 from thermostand.stand.safety.gate import HELD, OPERATOR, RELEASED
+
+# The output that a chamber at rest needs at its set-point, learned during the run: far from it, something is wrong.
+
+OUTPUT_NOT_AS_NEEDED = guard_rule(
+    "output_not_as_needed", "the regulator needs another output than before for the same set-point"
+)
+_FLAP_OPEN_ABOVE = 0.05  # as in interlocks.py
+_BAND_K, _POWER_MEAN_S = 2.0, 300.0  # at its set-point; the cycles of a relay's output are a minute
+# In proportion, set-points twice as far apart differ by 20 %, close to the limit of 25.
+_POWER_NEAR_K = 3.0  # a set-point so near needs the same within 10 % in good sessions
+_LEARNING = 0.25  # share of a new mean; the first is taken whole
+
+
+@dataclass(frozen=True, slots=True)
+class RestState:
+    """What the chamber rests at."""
+
+    set_point_degC: float
+    compressor: float
+
+
+@dataclass(frozen=True, slots=True)
+class PowerState:
+    """A state at rest since `since_ns`, the output summed over `count` looks since `begun_ns`; what was learned, %."""
+
+    rest: RestState | None = None
+    since_ns: int = 0
+    begun_ns: int = 0
+    sum_percent: float = 0.0
+    count: int = 0
+    learned: Mapping[RestState, float] = field(default_factory=dict[RestState, float])
+
+
+def find_nearest(learned: Mapping[RestState, float], rest: RestState) -> float | None:
+    """Return what was needed at the nearest set-point with the compressor alike; None where nothing near was
+    learned."""
+    found = [
+        (abs(other.set_point_degC - rest.set_point_degC), percent)
+        for other, percent in learned.items()
+        if other.compressor == rest.compressor and abs(other.set_point_degC - rest.set_point_degC) <= _POWER_NEAR_K
+    ]
+    return min(found)[1] if found else None
+
+
+def limit_output_deviation(
+    limits: SteadyStatePowerConfig, regulator: str, permit: str, compressor: str, flap: str
+) -> Rule:
+    """The chamber needs far more, or far less, than it did at about this set-point: a probe that shows too little, or
+    holds still, makes the regulator heat on."""
+
+    def rest_of(readings: Readings) -> RestState | None:
+        set_point_degC = get_value(readings, f"{regulator}.sp")
+        off_K = abs(get_value(readings, f"{regulator}.pv") - set_point_degC)
+        is_controlled = get_value(readings, f"{regulator}.running") == 1 and get_value(readings, permit) == 1
+        is_open = get_value(readings, flap) > _FLAP_OPEN_ABOVE
+        if not (is_controlled and off_K <= _BAND_K) or is_open:
+            return None
+        on = get_value(readings, compressor)
+        return None if math.isnan(on) else RestState(set_point_degC, on)
+
+    def step(last: PowerState | None, readings: Readings, now_ns: int) -> tuple[PowerState | None, Fault | None]:
+        last = last or PowerState()
+        rest = rest_of(readings)
+        if rest is None or rest != last.rest:
+            return PowerState(rest, since_ns=now_ns, learned=last.learned), None
+        if now_ns - last.since_ns < to_ns(limits.settle_s):
+            return last, None
+        if last.count == 0:
+            last = replace(last, begun_ns=now_ns)
+        summed = replace(
+            last, sum_percent=last.sum_percent + compute_heat_percent(readings, regulator, permit), count=last.count + 1
+        )
+        if now_ns - summed.begun_ns < to_ns(_POWER_MEAN_S):
+            return summed, None
+        return _judge_mean(summed, rest, limits, regulator)
+
+    return make_stateful_rule(step)
+
+
+def _judge_mean(
+    needs: PowerState, rest: RestState, limits: SteadyStatePowerConfig, regulator: str
+) -> tuple[PowerState, Fault | None]:
+    mean_percent = needs.sum_percent / needs.count
+    needed_percent = find_nearest(needs.learned, rest)
+    state = replace(needs, sum_percent=0.0, count=0)
+    if needed_percent is not None and abs(mean_percent - needed_percent) > limits.limit_percent:
+        text = f"{regulator} heats by {mean_percent:.0f} % at {rest.set_point_degC:.1f} degC, where the chamber needed"
+        return state, Fault(OUTPUT_NOT_AS_NEEDED, f"{text} {needed_percent:.0f} % before")
+    was_percent = needs.learned.get(rest)
+    now_percent = mean_percent if was_percent is None else was_percent + _LEARNING * (mean_percent - was_percent)
+    return replace(state, learned={**needs.learned, rest: now_percent}), None
+
+
+# Two thermometers in the same air, compared with themselves: a slow drift of one shows when a set-point is held again,
+# or for long, long before it is large enough to be a disagreement.
+
+SENSOR_DRIFTS = guard_rule("sensor_drifts", "two sensors of the same air drift apart while it is at rest", SENSOR)
+_NEAR_K = 1.0  # of the set-point, or it is not held
+_STILL_AFTER_S, _MEAN_S = 3600.0, 600.0  # walls have followed by then; over which a mean is taken
+
+Key = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _HeldSetPoint:
+    """The set-point and what else is as it was, since when; the sums over the readings of the means under way, of
+    channel minus other and minus each third; what each such state had at first (K, ns), and what is to be reported."""
+
+    key: Key
+    since_ns: int
+    sums_K: tuple[float, ...] = ()
+    count: int = 0
+    first: Mapping[Key, tuple[tuple[float, ...], int]] = field(default_factory=dict[Key, tuple[tuple[float, ...], int]])
+    fault: Fault | None = None
+
+
+def limit_sensor_drift(
+    pair: tuple[str, str], set_point: str, same: Sequence[str], limit_K: float, thirds: Sequence[str] = ()
+) -> Rule:
+    """The difference of both, held at a set-point, has changed by more than `limit_K` since that was first held, with
+    the channels `same` (0 or 1: flap, supplies) as they were. thirds: others in that air, which show who of both it
+    is."""
+    channel, other = pair
+
+    def step(last: _HeldSetPoint | None, readings: Readings, now_ns: int) -> tuple[_HeldSetPoint | None, Fault | None]:
+        sp_degC, value_degC = get_value(readings, set_point), get_value(readings, channel)
+        difference_K = value_degC - get_value(readings, other)
+        key = (round(sp_degC, 1), *(float(get_value(readings, each) > 0.5) for each in same))
+        if math.isnan(difference_K) or not abs(value_degC - sp_degC) < _NEAR_K or last is None or key != last.key:
+            known = {} if last is None else last.first
+            return _HeldSetPoint(key, now_ns, first=known, fault=last and last.fault), last and last.fault
+        held_s = (now_ns - last.since_ns) / NS_PER_S
+        if held_s < _STILL_AFTER_S:
+            return last, last.fault
+        apart_K = (difference_K, *(value_degC - get_value(readings, third) for third in thirds))
+        sums_K = last.sums_K or (0.0,) * len(apart_K)
+        held = replace(last, sums_K=tuple(a + b for a, b in zip(sums_K, apart_K, strict=True)), count=last.count + 1)
+        if held_s >= _STILL_AFTER_S + _MEAN_S:
+            held = _compared(held, now_ns)
+        return held, held.fault
+
+    def _compared(held: _HeldSetPoint, now_ns: int) -> _HeldSetPoint:
+        means_K = tuple(sum_K / held.count for sum_K in held.sums_K)
+        first_K, first_ns = held.first.get(held.key, (means_K, now_ns))
+        known = {**held.first, held.key: (first_K, first_ns)}
+        hours, changes_K = (now_ns - first_ns) / NS_PER_S / 3600, [b - a for a, b in zip(first_K, means_K, strict=True)]
+        fault = None
+        if abs(changes_K[0]) > limit_K:
+            text = (
+                f"{channel} minus {other} at {held.key[0]:g} degC has changed by {1e3 * changes_K[0]:+.0f} mK in "
+                f"{hours:.1f} h ({1e3 * changes_K[0] / hours:+.1f} mK/h)"
+            )
+            found = _suspicion(changes_K)
+            fault = Fault(SENSOR_DRIFTS, text + found.words(pair), channels=pair, suspect=found.suspect)
+        return _HeldSetPoint(held.key, now_ns - to_ns(_STILL_AFTER_S), first=known, fault=fault)
+
+    def _suspicion(changes_K: Sequence[float]) -> Suspicion:
+        """Judge by the thirds, each of which has to be nearer to one of both by twice."""
+        of_channel, of_other = list[str](), list[str]()
+        for third, from_channel_K in zip(thirds, changes_K[1:], strict=True):
+            from_other_K = from_channel_K - changes_K[0]
+            if abs(from_channel_K) > 2 * abs(from_other_K):
+                of_channel.append(third)
+            elif abs(from_other_K) > 2 * abs(from_channel_K):
+                of_other.append(third)
+        if len(of_channel) == len(of_other):
+            return Suspicion()
+        is_channel = len(of_channel) > len(of_other)
+        return Suspicion(channel if is_channel else other, tuple(of_channel if is_channel else of_other))
+
+    return make_stateful_rule(step)
+
 
 # The first heat of a daemon: do the regulator's probe, its heater and the chamber's air belong together?
 

@@ -7,7 +7,7 @@ from thermostand.foundation.clock import to_ns
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Reading, bad_reading
-from thermostand.stand.guarding.sensor_drift import limit_sensor_drift
+from thermostand.stand.guarding.rules import limit_sensor_drift
 
 AIR, OTHER, SP, FLAP = "thermometers.air", "thermometers.ceiling", "regulator.sp", "flap.position"
 STEP_S = 30.0

@@ -16,8 +16,7 @@ from thermostand.stand.config.chamber_section import (
     SteadyStatePowerConfig,
 )
 from thermostand.stand.guarding.heat_balance import limit_heat_energy, require_heat_response
-from thermostand.stand.guarding.rules import require_startup_response
-from thermostand.stand.guarding.steady_state_power import limit_output_deviation
+from thermostand.stand.guarding.rules import limit_output_deviation, require_startup_response
 from thermostand.stand.guarding.stuck_sensor import forbid_stuck_sensor
 from thermostand.stand.guarding.thermal_crosscheck import crosscheck_by_camera, crosscheck_by_granite
 from thermostand.stand.safety.fault import Rule

@@ -11,8 +11,8 @@ from thermostand.foundation.items import Batch
 from thermostand.foundation.readings import Quality, Reading
 from thermostand.stand.config.chamber_section import ChamberConfig
 from thermostand.stand.guarding.interlocks import limit_disagreement
+from thermostand.stand.guarding.rules import limit_sensor_drift
 from thermostand.stand.guarding.sensor_diagnosis import SensorHistory, name_suspect
-from thermostand.stand.guarding.sensor_drift import limit_sensor_drift
 from thermostand.stand.safety.fault import Fault
 
 PV, AIR, CEILING, GRANITE, CAMERA = (
