@@ -12,6 +12,7 @@ from scipy.special import ndtr
 
 from tests.nightly import mark_nightly
 from thermostand.markers import edge_fit
+from thermostand.markers.detection import detect
 from thermostand.markers.edge_fit import EdgeFit, Flag, fit_edges
 from thermostand.markers.edge_model import (
     B0,
@@ -47,6 +48,7 @@ from thermostand.markers.pixels import (
     gather,
     make_picture,
 )
+from thermostand.markers.target import Target
 
 from .renderer import Scene, compute_true_centres_px, make_shaded_light, photograph, project, render
 
@@ -264,3 +266,21 @@ def test_the_fit_reads_its_inputs_only():
     fit(scene, image, start)
     np.testing.assert_array_equal(image, before)
     np.testing.assert_array_equal(start.parameters, parameters)
+
+
+@pytest.mark.parametrize("tail", [0.1, 0.3])
+def test_a_blur_with_one_side_moves_all_outlines_towards_it_without_a_flag(tail: float):
+    """Of an exponential tail to the right, whose centre of gravity is known."""
+    scene = Scene(size=(640, 480), f_px=2000, diameter_mm=10)
+    target = Target(name="coma", columns=9, rows=6, pitch_mm=30, diameter_mm=10)
+    clean = render(scene)
+    kernel = np.zeros(13)
+    kernel[6:] = tail * np.exp(-np.arange(7) / 0.7)
+    kernel[6] = 1 - kernel[7:].sum()
+    centre_px = float(kernel @ (np.arange(13) - 6))
+    blurred = np.apply_along_axis(np.convolve, 1, np.pad(clean, ((0, 0), (6, 6)), "edge"), kernel, "valid")
+    before, after = (detect(photograph(scene, image, seed), target) for seed, image in ((1, clean), (2, blurred)))
+    moved = after.centres_px - before.centres_px
+    assert not after.flags.any()
+    assert moved.mean(axis=0) == pytest.approx([0.82 * centre_px, 0.0], abs=0.004)
+    assert moved.std(axis=0) == pytest.approx([0.0, 0.0], abs=0.009)
