@@ -1,7 +1,7 @@
 """What an operator may order: one method of a stand's service with one typed argument.
 
     @command("/run/skip")
-    async def skip(self, who: Who, given: SkipRequest) -> str:
+    async def skip(self, who: Requester, given: SkipRequest) -> str:
         "Leave a step out, or break it off."
 
 From it follow the route and its OpenAPI (api/app.py), the verb of the command line (commands/verbs.py), the
@@ -87,7 +87,7 @@ def command(
 ) -> Callable[[Method], Method]:
     """A method is a command, at this path below /api/v1, in which {name} is a field of its argument.
 
-    It takes who asks and, if anything, one Document, and returns a sentence, for the answer Done, or a value. It raises
+    It takes who asks and, if anything, one Document, and returns a sentence, for the answer CommandAnswer, or a value. It raises
     Conflict when the state forbids it, Missing, or ConfigError when the argument is wrong. verbs: of the command line,
     such as `queue move`; its name where none is given, () for none that only sends. title: what a button for it is
     called, its name where none is given. anywhere: its verb finds the only stand of this machine. by_secop: the field

@@ -146,7 +146,7 @@ DAEMON = """
 import asyncio, os, resource, sys
 from pathlib import Path
 from thermostand.stand.serving.api.listeners import Interface
-from thermostand.stand.serving.api_models import Done
+from thermostand.stand.serving.api_models import CommandAnswer
 from tests.stand.fake_service import FakeService, serve_fake
 
 class Desk(FakeService):
