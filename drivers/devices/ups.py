@@ -39,7 +39,7 @@ _NAME = r"[A-Za-z0-9_.-]{1,64}"
 _WORD = r"[!-~]{1,100}"
 _VALUE = re.compile(r'VAR \S+ \S+ "((?:[^"\\]|\\.)*)"')
 _LISTED = re.compile(rf'UPS ({_NAME}) "')
-_NOT_TOLD = ("VAR-NOT-SUPPORTED", "UNKNOWN-VAR")
+_NOT_REPORTED = ("VAR-NOT-SUPPORTED", "UNKNOWN-VAR")
 # upsd answers, and knows nothing of the UPS now: as if nobody had answered.
 _SILENT = {"DATA-STALE": "upsd has no fresh data of it", "DRIVER-NOT-CONNECTED": "its driver is not connected to upsd"}
 _LOW = {"LB", "FSD"}  # FSD: a primary upsmon has ordered the shutdown
@@ -76,7 +76,7 @@ class UpsSecrets(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _Reported:
     """What upsd tells of the UPS. None: it does not tell that."""
 
     status: str
@@ -124,7 +124,7 @@ class Ups:
             if self._worker is None:
                 raise Unreachable(self.name, "not open")
             async with self._lock:
-                told = await self._worker.call(self._ask_all)
+                reported = await self._worker.call(self._ask_all)
         except DeviceError as error:
             if self.is_required:
                 raise
@@ -132,27 +132,27 @@ class Ups:
             return tuple(
                 bad_reading(f"{self.name}.{each.name}", each.unit, now_ns, str(error), cause) for each in CHANNELS
             )
-        return tuple(self._make_readings(told))
+        return tuple(self._make_readings(reported))
 
-    def _make_readings(self, told: _Told) -> list[Reading]:
-        now_ns, words = self._clock.now_ns(), set(told.status.split())
+    def _make_readings(self, reported: _Reported) -> list[Reading]:
+        now_ns, words = self._clock.now_ns(), set(reported.status.split())
         is_known = bool(words & _KNOWN_POWER)
         flags = (("OB" in words), bool(words & _LOW)) if is_known else (None, None)
         is_well = "OL" in words and not words & _CARE
         readings: list[Reading] = []
-        for channel, value in zip(CHANNELS, (told.charge, told.runtime, *flags), strict=True):
-            name, reason = f"{self.name}.{channel.name}", told.status
+        for channel, value in zip(CHANNELS, (reported.charge, reported.runtime, *flags), strict=True):
+            name, reason = f"{self.name}.{channel.name}", reported.status
             if value is None:
-                reason = f"the UPS does not tell it (its status is {told.status!r})"
+                reason = f"the UPS does not tell it (its status is {reported.status!r})"
                 readings.append(bad_reading(name, channel.unit, now_ns, reason))
             else:
-                reason = told.status if channel.kind == "flag" and not is_well else ""
+                reason = reported.status if channel.kind == "flag" and not is_well else ""
                 readings.append(Reading(name, float(value), channel.unit, now_ns, reason=reason))
         return readings
 
     # Below: in the worker's thread.
 
-    def _ask_all(self) -> _Told:
+    def _ask_all(self) -> _Reported:
         self._has_begun = self._has_begun and self._client.connected
         if not self._has_begun:
             self._begin()  # again, too, where upsd did not know the UPS yet
@@ -161,9 +161,9 @@ class Ups:
         if status is None:
             raise DeviceFault(self.name, "does not tell its status")
         if self.identity is None or not self.identity.vendor:  # a driver that has just started tells it later
-            told = (self._get(f"device.{each}") or "" for each in ("mfr", "model", "serial"))
-            self.identity = Identity(*(each.strip() for each in told), version="")
-        return _Told(status, self._get_number("battery.charge"), self._get_number("battery.runtime"))
+            reported = (self._get(f"device.{each}") or "" for each in ("mfr", "model", "serial"))
+            self.identity = Identity(*(each.strip() for each in reported), version="")
+        return _Reported(status, self._get_number("battery.charge"), self._get_number("battery.runtime"))
 
     def _begin(self) -> None:
         """Over each new connection: which UPS there is, and the login."""
@@ -201,7 +201,7 @@ class Ups:
         if error is None:
             found = _VALUE.fullmatch(reply)
             return None if found is None else re.sub(r"\\(.)", r"\1", found[1])
-        if error in _NOT_TOLD:
+        if error in _NOT_REPORTED:
             return None
         if error in _SILENT:
             raise Unreachable(self.name, _SILENT[error])

@@ -87,11 +87,11 @@ def command(
 ) -> Callable[[Method], Method]:
     """A method is a command, at this path below /api/v1, in which {name} is a field of its argument.
 
-    It takes who asks and, if anything, one Document, and returns a sentence, for the answer CommandAnswer, or a value. It raises
-    Conflict when the state forbids it, Missing, or ConfigError when the argument is wrong. verbs: of the command line,
-    such as `queue move`; its name where none is given, () for none that only sends. title: what a button for it is
-    called, its name where none is given. anywhere: its verb finds the only stand of this machine. by_secop: the field
-    that SECoP's command takes, "" for the only one that is required, None for no such command.
+    It takes who asks and, if anything, one Document, and returns a sentence, for the CommandAnswer, or a value. It
+    raises Conflict when the state forbids it, Missing, or ConfigError when the argument is wrong. verbs: of the command
+    line, such as `queue move`; its name where none is given, () for none that only sends. title: what a button for it
+    is called, its name where none is given. anywhere: its verb finds the only stand of this machine. by_secop: the
+    field that SECoP's command takes, "" for the only one that is required, None for no such command.
     role: that it needs, None for nobody's.
     """
 

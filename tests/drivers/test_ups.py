@@ -157,7 +157,7 @@ async def test_replies_in_pieces_and_connections_that_end_are_read(bench: Bench,
     assert values(await bench.read()) == [100.0, 1800.0, 0.0, 0.0]
 
 
-async def test_a_stand_opens_without_it_and_reads_it_once_it_is_there():
+async def test_a_stand_opens_without_it_and_reads_it_once_it_answers():
     driver = make_driver("tcp:127.0.0.1:9")
     await driver.open()
     assert {each.quality for each in await driver.read()} == {Quality.BAD}

@@ -304,7 +304,7 @@ async def test_a_simulated_stand_is_broken_and_mended_and_a_real_one_is_not(desk
         assert await page.get_by_role("heading", name="Faults on purpose").count() == 0
 
 
-async def test_who_operates_may_not_clear_a_trip_nor_heat_by_hand_and_is_told_which_role_may(desk):
+async def test_who_operates_may_not_clear_a_trip_nor_heat_by_hand_and_reads_which_role_may(desk):
     desk.is_idle = True
     known = {"name": "ann", "how": "token", "role": "operate"}
     async with a_page(desk.chromium, desk.port, "devices") as page:

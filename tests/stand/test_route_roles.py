@@ -61,10 +61,10 @@ async def test_each_route_is_refused_to_each_role_that_is_not_enough_and_to_no_o
                 needed = needs.get(key, "look")
                 assert described.get("x-role", "look") == (needed or "none")
                 for role in ROLES:
-                    status, said = await asked(port, method.upper(), path.format(**NAMES), role, {})
+                    status, body = await asked(port, method.upper(), path.format(**NAMES), role, {})
                     is_refused = needed is not None and not may(role, needed)
                     # A body that is wrong is 422; who is refused does not get so far, or learns of the body first.
-                    assert (status == 403) == is_refused or (status == 422 and is_refused), (key, role, status, said)
+                    assert (status == 403) == is_refused or (status == 422 and is_refused), (key, role, status, body)
                     tried += 1
         assert tried > 3 * len(needs)
         assert {key for key in needs if key[1] not in document["paths"]} == set()
@@ -103,8 +103,8 @@ async def test_heat_by_hand_is_for_who_commissions_and_a_refusal_is_recorded(
 async def test_a_trip_is_cleared_by_who_commissions_and_the_sentence_names_the_role(tmp_path: Path):
     async with open_stand(tmp_path) as (desk, port):
         desk.gate.hold("interlock")
-        status, said = await asked(port, "POST", f"{API}/run/reset", "operate")
-        assert (status, "reset needs the role commission, and the token of operate" in said["error"]) == (403, True)
+        status, body = await asked(port, "POST", f"{API}/run/reset", "operate")
+        assert (status, "reset needs the role commission, and the token of operate" in body["error"]) == (403, True)
         assert desk.gate.reasons == {"interlock"}
         assert (await asked(port, "POST", f"{API}/run/reset", "commission"))[0] == 200
         assert desk.gate.reasons == set()

@@ -44,8 +44,8 @@ def test_the_image_is_slim_has_no_rights_and_keeps_sessions_and_trips_in_volumes
 
 def test_what_is_copied_into_the_build_is_what_the_wheel_is_made_of():
     kept = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
-    rooms = {path.name for path in (ROOT / "thermostand").iterdir() if path.is_symlink()}
-    assert rooms | {"thermostand", "pyproject.toml", "constraints.txt", "README.md", "LICENSE"} <= kept
+    folders = {path.name for path in (ROOT / "thermostand").iterdir() if path.is_symlink()}
+    assert folders | {"thermostand", "pyproject.toml", "constraints.txt", "README.md", "LICENSE"} <= kept
     assert all((ROOT / name).exists() for name in kept)
 
 

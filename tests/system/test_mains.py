@@ -110,7 +110,7 @@ async def test_a_silent_upsd_warns_and_never_holds(tmp_path: Path, fault: str):
     assert (ended, guard_events(seen)) == ("complete", [("guard.ups_silent", "warn")])
 
 
-class Told:
+class Reported:
     """What a UPS has told, and the rules on it."""
 
     def __init__(self, **settings: object) -> None:
@@ -121,19 +121,19 @@ class Told:
     def look(self, at_s: int, on_battery: float | None, left_s: float = 1000.0) -> tuple[bool, bool]:
         """Whether it holds, and whether it ends; None: it is silent."""
         time_ns = to_ns(at_s)
-        told = {"charge": 80.0, "runtime": left_s, "on_battery": on_battery, "low_battery": 0.0}
+        reported = {"charge": 80.0, "runtime": left_s, "on_battery": on_battery, "low_battery": 0.0}
         readings = tuple(
             bad_reading(f"ups.{name}", "1", time_ns, "silent", "wire")
             if on_battery is None or value is None
             else Reading(f"ups.{name}", value, "1", time_ns)
-            for name, value in told.items()
+            for name, value in reported.items()
         )
         self.hub.publish(Batch("ups", time_ns, readings))
         return self.hold(self.hub, time_ns) is not None, self.end(self.hub, time_ns) is not None
 
 
-def test_a_short_loss_is_none_and_a_second_loss_begins_the_wait_anew():
-    ups = Told()
+def test_a_short_loss_is_none_and_a_second_loss_begins_the_wait_again():
+    ups = Reported()
     assert [ups.look(at_s, value)[0] for at_s, value in ((0, 1), (4, 1), (6, 0), (8, 1), (12, 0))] == [False] * 5
     assert [ups.look(at_s, value)[0] for at_s, value in ((20, 1), (25, 1), (30, 0), (120, 0))] == [
         False,
@@ -147,7 +147,7 @@ def test_a_short_loss_is_none_and_a_second_loss_begins_the_wait_anew():
 
 
 def test_silence_begins_no_hold_ends_none_and_the_time_that_was_left_goes_on():
-    ups = Told(end_below_s=300)
+    ups = Reported(end_below_s=300)
     assert ups.look(0, None) == (False, False)
     assert ups.look(10, 0) == (False, False)
     assert ups.look(5000, None) == (False, False)

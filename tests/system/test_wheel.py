@@ -42,46 +42,53 @@ def list_files(folder: Path) -> set[Path]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With an environment `there`, in which nothing is installed."""
+    """With an environment `installed`, in which nothing is installed."""
     made = tmp_path_factory.mktemp("elsewhere")
-    venv.create(made / "there", with_pip=False)
-    (site,) = (made / "there").glob("lib/python*/site-packages")
+    venv.create(made / "installed", with_pip=False)
+    (site,) = (made / "installed").glob("lib/python*/site-packages")
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    (made / "files.json").write_text(json.dumps(sorted(map(str, list_files(made / "there")))))
+    (made / "files.json").write_text(json.dumps(sorted(map(str, list_files(made / "installed")))))
     run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", made / "dist"], ROOT)
     (wheel,) = (made / "dist").glob("*.whl")
-    pip = [sys.executable, "-m", "pip", "--python", made / "there" / "bin" / "python", "--disable-pip-version-check"]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        made / "installed" / "bin" / "python",
+        "--disable-pip-version-check",
+    ]
     run([*pip, "install", "--quiet", "--no-deps", "--no-index", "--no-compile", wheel], made)
     return made
 
 
 @pytest.mark.nightly
 def test_the_wheel_runs_outside_of_the_clone_and_leaves_nothing_behind(folder: Path):
-    there = folder / "there" / "bin"
+    installed = folder / "installed" / "bin"
     where = (
         "import thermostand.stand, importlib.metadata as m; print(thermostand.stand.__file__, m.version('thermostand'))"
     )
-    assert run([there / "python", "-c", where], folder).startswith(str(folder / "there"))
-    assert "thermal-cycle" in run([there / "stand", "recipes"], folder)
+    assert run([installed / "python", "-c", where], folder).startswith(str(folder / "installed"))
+    assert "thermal-cycle" in run([installed / "stand", "recipes"], folder)
     (folder / "look.yaml").write_text(RECIPE)
     run(
-        [there / "stand", "run", "look.yaml", "--config", "simulated", "--virtual-time", "--out", "sessions"],
+        [installed / "stand", "run", "look.yaml", "--config", "simulated", "--virtual-time", "--out", "sessions"],
         folder,
     )
     (session,) = (folder / "sessions").glob("*-look")
-    assert json.loads(run([there / "stand", "session", "verify", session, "--json"], folder))
+    assert json.loads(run([installed / "stand", "session", "verify", session, "--json"], folder))
     write_target(folder)
     for seed, degC in enumerate((10, 14, 18, 22, 26, 30)):
         write_picture(folder / "pictures" / f"t{degC}" / "1.png", degC, 700, seed)
-    run([there / "compensate", "observe", "pictures", "--target", "small.yaml", "-o", "centres.csv"], folder)
-    run([there / "compensate", "fit", "centres.csv", "-o", "model.json"], folder)
+    run([installed / "compensate", "observe", "pictures", "--target", "small.yaml", "-o", "centres.csv"], folder)
+    run([installed / "compensate", "fit", "centres.csv", "-o", "model.json"], folder)
     picture = ["pictures/t10/1.png", "--camera-degC", "10", "-o", "corrected.tiff"]
-    run([there / "compensate", "apply", "model.json", *picture], folder)
+    run([installed / "compensate", "apply", "model.json", *picture], folder)
     corrected = cv2.imread(str(folder / "corrected.tiff"), cv2.IMREAD_UNCHANGED)
     assert corrected is not None
     assert corrected.shape == (256, 320)
     assert len(list((folder / "cache" / "thermostand" / "machine-code").rglob("*.nbi"))) >= 5
-    pip = [sys.executable, "-m", "pip", "--python", there / "python", "--disable-pip-version-check"]
+    pip = [sys.executable, "-m", "pip", "--python", installed / "python", "--disable-pip-version-check"]
     run([*pip, "uninstall", "--quiet", "--yes", "thermostand"], folder)
     before = json.loads((folder / "files.json").read_text())
-    assert sorted(map(str, list_files(folder / "there"))) == before
+    assert sorted(map(str, list_files(folder / "installed"))) == before
