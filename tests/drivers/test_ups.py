@@ -58,7 +58,7 @@ async def bench() -> AsyncIterator[Bench]:
     found.wire.close()
 
 
-async def test_it_tells_which_ups_it_is_what_is_left_and_whether_there_is_mains(bench: Bench):
+async def test_it_reports_which_ups_it_is_what_is_left_and_whether_mains_is_on(bench: Bench):
     await bench.driver.open()
     found = await bench.read()
     assert [(name, each.unit) for name, each in found.items()] == [

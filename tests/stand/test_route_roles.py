@@ -34,7 +34,7 @@ async def open_stand(folder: Path, single_sign_on: SingleSignOnConfig | None = N
     tokens = TokenFile.model_validate({key: {role: TOKENS[role]} for key, role in known.items()})
     port, desk = free_port(), Desk()
     interface = Interface(folder, port=port, tokens=TokenStore(tokens), single_sign_on=single_sign_on)
-    async with serve_fake(desk, folder / "night", interface):
+    async with serve_fake(desk, folder / "cycle", interface):
         yield desk, port
 
 
@@ -139,7 +139,7 @@ async def test_a_proxy_that_the_file_names_says_who_asks_and_no_other_does(tmp_p
 async def test_a_proxy_on_this_machine_makes_nobody_local_and_who_has_no_role_needs_a_token(tmp_path: Path):
     settings = SingleSignOnConfig(proxies=("127.0.0.1",), users={"rose": "commission"})
     interface = Interface(tmp_path, port=free_port(), single_sign_on=settings)  # no tokens: this machine may order
-    async with serve_fake(FakeService(), tmp_path / "night", interface):
+    async with serve_fake(FakeService(), tmp_path / "cycle", interface):
         port = interface.port or 0
         answers = [
             (await asyncio.to_thread(ask, port, "GET", f"{API}/who", headers))[0]
