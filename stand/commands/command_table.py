@@ -49,6 +49,9 @@ app = make_lazy_app(
         ),
         "resume": LazyCommand(_RUN, "Resume a run that was killed or interrupted, in its session."),
         "status": LazyCommand(_CONTROL, "Show what the run under way is doing."),
+        "overview": LazyCommand(
+            "thermostand.stand.commands.overview_cli", "All stands at a glance, and the sessions of all."
+        ),
         "watch": LazyCommand(_CONTROL, "Follow a run live: its messages and its progress."),
         "foxglove": LazyCommand(
             "thermostand.stand.commands.foxglove_cli", "Show a running stand live in Foxglove or Lichtblick."

@@ -46,6 +46,13 @@ class SingleSignOnConfig(Document):
     others: Role | None = None
 
 
+class RemoteStand(Document):
+    """A stand elsewhere that is shown among all stands. token_file: one line with a token of it, read-only suffices."""
+
+    url: str = Field(pattern=r"^https?://[^\s/@]+/?$", max_length=300)
+    token_file: Path | None = None
+
+
 class InterfaceConfig(Document):
     """How a stand is reached over the network. port: where `stand serve` and `stand run` have the page and the HTTP
     interface on this machine, as with --port; by the Unix socket only without it. hosts: names under which browsers and
@@ -55,7 +62,8 @@ class InterfaceConfig(Document):
     answer SECoP on this machine, usually 10767, as with --secop; not at all without it. trust_loopback: who asks from
     this machine needs no token all the same, and may do everything (`true`), or only look and press STOP
     (`read-only`, also where no secrets are named); a proxy on this machine that adds no header makes everybody behind
-    it one who asks from this machine. single_sign_on: a proxy that tells who asks.
+    it one who asks from this machine. single_sign_on: a proxy that tells who asks. stands: others, elsewhere,
+    that the page shows with those of this machine.
     """
 
     trust_loopback: bool | Literal["read-only"] = False
@@ -64,6 +72,7 @@ class InterfaceConfig(Document):
     port: int | None = Field(default=None, ge=1, le=65535)
     secop_port: int | None = Field(default=None, ge=1, le=65535)
     single_sign_on: SingleSignOnConfig | None = None
+    stands: tuple[RemoteStand, ...] = Field(default=(), max_length=50)
 
 
 KEYS: dict[Role, str] = {"commission": "tokens", "operate": "operate", "look": "read_only"}

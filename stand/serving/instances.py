@@ -35,13 +35,14 @@ _SOCKETS = (".sock", STOP_SUFFIX)
 @dataclass(frozen=True, slots=True)
 class DaemonEntry:
     """session: its folder's path when the run began. real_path: the same without symbolic links, and identity: its
-    device and inode, once the disk has given them."""
+    device and inode, once the disk has given them. url: where its page is, "" without one."""
 
     session: str
     pid: int
     stand: str
     real_path: str = ""
     identity: tuple[int, int] | None = None
+    url: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +204,7 @@ def _decode(content: bytes) -> DaemonEntry:
         str(fields["stand"]),
         str(fields["real_path"]),
         None if identity is None else (identity[0], identity[1]),
+        str(fields.get("url", "")),
     )
 
 

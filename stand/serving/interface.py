@@ -34,7 +34,15 @@ def make_interface(
     doors = () if secop is None else (make_secop_listener(secop, read_only=trusts == "read-only"),)
     sign_on = settings.single_sign_on
     found = Interface(
-        sessions, host, port, book, settings.hosts, trusts_loopback=trusts, doors=doors, single_sign_on=sign_on
+        sessions,
+        host,
+        port,
+        book,
+        settings.hosts,
+        trusts_loopback=trusts,
+        doors=doors,
+        single_sign_on=sign_on,
+        stands=settings.stands,
     )
     found.check()
     check_ports(found)

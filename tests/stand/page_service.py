@@ -19,6 +19,7 @@ from thermostand.experiments.steps import PlannedStep, make_step
 from thermostand.foundation.clock import NS_PER_S, WallClock
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading, bad_reading
+from thermostand.stand.config.interface_section import RemoteStand
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.memory.entries import StepChanged as StepChanged
 from thermostand.stand.running.memory.fold import fold
@@ -339,7 +340,12 @@ def free_port() -> int:
 
 @asynccontextmanager
 async def serve_cycle(
-    folder: Path, port: int, *, with_frames: bool = False, prepare: Callable[[CycleService], None] = lambda _: None
+    folder: Path,
+    port: int,
+    *,
+    with_frames: bool = False,
+    stands: tuple[RemoteStand, ...] = (),
+    prepare: Callable[[CycleService], None] = lambda _: None,
 ) -> AsyncGenerator[CycleService]:
     """The session, served at that port while inside."""
     desk = CycleService()
@@ -352,7 +358,9 @@ async def serve_cycle(
     folder.mkdir(exist_ok=True)
     polling = asyncio.create_task(desk.end_pause())
     try:
-        async with serve_fake(desk, folder / "now", Interface(folder, port=port, extra_routes=(PageRoutes(viewing),))):
+        async with serve_fake(
+            desk, folder / "now", Interface(folder, port=port, stands=stands, extra_routes=(PageRoutes(viewing),))
+        ):
             if with_frames:
                 desk.hub.publish(frame_of(target_image(0, 0), desk.began_ns))
                 while not viewing.previews:

@@ -31,11 +31,20 @@ from thermostand.stand.serving.api.listeners import Interface, ProtocolListener
 from thermostand.stand.serving.client import make_server
 
 TOKEN, LOOKS = "correct-horse-battery-staple", "only-looks-and-stops-for-wall"
-CHANGES_NOTHING = (STOP_PATH, CHECK_PATH, PREVIEW_PATH, INVITE_PATH)
+STOP_ELSEWHERE = f"/api/v1/overview/{16 * '0'}/stop"
+CHANGES_NOTHING = (STOP_ELSEWHERE, STOP_PATH, CHECK_PATH, PREVIEW_PATH, INVITE_PATH)
 EVIL = "http://evil.example"
 # What a proxy adds: such a request is from elsewhere, and needs a token.
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
-NAMES = {"run": "1", "name": "flap", "device": "flap", "recipe": "demo", "session": "cycle", "verb": "open"}
+NAMES = {
+    "run": "1",
+    "name": "flap",
+    "device": "flap",
+    "recipe": "demo",
+    "session": "cycle",
+    "verb": "open",
+    "key": "0" * 16,
+}
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",

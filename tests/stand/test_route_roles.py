@@ -52,6 +52,7 @@ async def test_each_route_is_refused_to_each_role_that_is_not_enough_and_to_no_o
     needs: dict[tuple[str, str], Role | None] = {
         (each.http, f"{API}{each.path}"): each.role for each in collect_commands(StandService).values()
     }
+    needs["POST", f"{API}/overview/{{key}}/stop"] = None
     async with open_stand(tmp_path) as (_, port):
         _, document = await asked(port, "GET", "/openapi.json", "commission")
         tried = 0

@@ -69,6 +69,7 @@ STOP_PATH = "/api/v1/run/stop"
 LOGIN_PATH, INVITE_PATH = "/login", "/api/v1/login"
 CHECK_PATH = "/api/v1/run/plan/check"
 PREVIEW_PATH = "/api/v1/recipes/preview"
+_STOP_ELSEWHERE = re.compile(r"/api/v1/overview/[0-9a-f]{16}/stop")
 _CHANGES_NOTHING = frozenset({STOP_PATH, INVITE_PATH, CHECK_PATH, PREVIEW_PATH})
 COOKIE = "thermostand"
 FAILED = "failed ({}); the stand's events say more"  # by what should not happen
@@ -342,7 +343,8 @@ def _parse_cookies(headers: Headers) -> Iterable[tuple[str, str]]:
 def is_exempt_from_token(path: str) -> bool:
     """Return what needs no token: STOP, whether all is well, and the page's own files, which are no secret: it has the
     button for STOP, and gets no data without a token."""
-    return path in (STOP_PATH, LOGIN_PATH, "/healthz", "/") or path.startswith("/static/")
+    is_page = path in (LOGIN_PATH, "/healthz", "/") or path.startswith("/static/")
+    return is_page or path == STOP_PATH or _STOP_ELSEWHERE.fullmatch(path) is not None
 
 
 class Gatekeeper:
@@ -423,7 +425,9 @@ class _HeaderSender:
 
 
 def _may_change(scope: Scope) -> bool:
-    return scope["type"] == "http" and scope["method"] not in _READS and scope["path"] not in _CHANGES_NOTHING
+    if scope["type"] != "http" or scope["method"] in _READS:
+        return False
+    return scope["path"] not in _CHANGES_NOTHING and not _STOP_ELSEWHERE.fullmatch(scope["path"])
 
 
 def _is_in_chunks(scope: Scope) -> bool:

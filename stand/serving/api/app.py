@@ -21,6 +21,7 @@ from thermostand.stand.config.interface_section import Role
 from thermostand.stand.serving.api.access import FAILED, Access, App, Gatekeeper
 from thermostand.stand.serving.api.bridge import Bridge, NoAnswer
 from thermostand.stand.serving.api.listeners import Interface
+from thermostand.stand.serving.api.overview_routes import make_overview_routes
 from thermostand.stand.serving.api.read_routes import make_read_routes
 from thermostand.stand.serving.api.session_routes import make_session_routes
 from thermostand.stand.serving.api.stream import Stream, make_json
@@ -226,6 +227,7 @@ def make_app(
     app.include_router(make_read_routes(bridge, stream, access, interface.url))
     app.include_router(make_command_routes(bridge))
     app.include_router(make_session_routes(bridge, interface.sessions))
+    app.include_router(make_overview_routes(interface.stands))
     for routes in interface.extra_routes:
         app.include_router(routes(bridge))
     for kind, status in _STATUS:

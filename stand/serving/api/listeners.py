@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from thermostand.foundation.errors import ConfigError
-from thermostand.stand.config.interface_section import SingleSignOnConfig
+from thermostand.stand.config.interface_section import RemoteStand, SingleSignOnConfig
 from thermostand.stand.serving.api.access import TokenStore, is_loopback
 from thermostand.stand.serving.api.bridge import Bridge
 
@@ -31,9 +31,9 @@ class Interface:
     """How a stand is reached besides its Unix socket.
 
     host, port: to listen at by TCP; no port, no TCP. hosts: names of this stand besides this machine's own.
-    trusts_loopback, single_sign_on: as in the stand's file. doors: other protocols' ports. sessions: the folder of
-    recorded sessions. extra_routes: makes what else is served (history, frames, the page) in the thread, as routers, by
-    the bridge.
+    trusts_loopback, single_sign_on, stands: as in the stand's file. doors: other protocols' ports. sessions: the folder
+    of recorded sessions. extra_routes: makes what else is served (history, frames, the page) in the thread, as routers,
+    by the bridge.
     """
 
     sessions: Path
@@ -45,6 +45,7 @@ class Interface:
     doors: tuple[ProtocolListener, ...] = ()
     extra_routes: Sequence[Callable[[Bridge], Any]] = ()
     single_sign_on: SingleSignOnConfig | None = None
+    stands: tuple[RemoteStand, ...] = ()
 
     @property
     def url(self) -> str:

@@ -47,7 +47,7 @@ async def serve(
     """
     hub, clock = service.hub, service.clock
     interface.check()
-    presence = DaemonInstance(DaemonEntry(os.path.abspath(session), os.getpid(), stand))  # noqa: ASYNC240 - no disk is asked
+    presence = DaemonInstance(DaemonEntry(os.path.abspath(session), os.getpid(), stand, url=interface.url))  # noqa: ASYNC240 - no disk is asked
     report, deadline = _make_reporter(hub, clock), deadline or ShutdownDeadline()
     everything, stopping = presence.publish()
     doors = {"socket": everything, "stop": stopping}

@@ -33,11 +33,13 @@ Result = TypeVar("Result")
 
 class SessionEntry(BaseModel):
     """A recorded session. begin_ns, end_ns: of its first and last message, None when it holds none. run: how it ended;
-    files: whether they are sound; has_report: whether there is one to be read. copies: folders with a verified copy."""
+    files: whether they are sound; camera_serial: of the camera;
+    has_report: whether there is one to be read. copies: folders with a verified copy."""
 
     name: str
     recipe: str
     operator: str
+    camera_serial: str
     simulated: bool
     begin_ns: int | None
     end_ns: int | None
@@ -150,6 +152,7 @@ def _make_entry(seen: ListedSession) -> SessionEntry:
         name=seen.name.encode("utf-8", "replace").decode(),
         recipe=seen.metadata.get("recipe", ""),
         operator=seen.metadata.get("operator", ""),
+        camera_serial=seen.metadata.get("camera_serial", ""),
         simulated=seen.simulated,
         begin_ns=seen.begin_ns,
         end_ns=seen.end_ns,

@@ -4,6 +4,7 @@ import { clock, day_clock, say, seconds } from "./dom.js";
 import { CameraView } from "./frame.js";
 import { Notices, reason } from "./notices.js";
 import { Now } from "./now.js";
+import { Overview } from "./overview.js";
 import { Plan, uncertainty } from "./plan.js";
 import { Queue } from "./queue.js";
 import { Sessions } from "./sessions.js";
@@ -11,7 +12,7 @@ import { arm } from "./stop.js";
 import { follow } from "./stream.js";
 import { look_who } from "./looking.js";
 
-const VIEWS = { now: Now, plan: Plan, queue: Queue, camera: CameraView, sessions: Sessions, devices: Devices };
+const VIEWS = { now: Now, plan: Plan, queue: Queue, camera: CameraView, sessions: Sessions, devices: Devices, stands: Overview };
 const PHASE = { idle: "Idle", by_hand: "Heat by hand", running: "Running", held: "Held", stopping: "Stopping", tripped: "Tripped", lost: "No connection" };
 const at = (id) => document.getElementById(id);
 
