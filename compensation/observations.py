@@ -29,6 +29,7 @@ from thermostand.foundation.readings import TEMPERATURE_SUSPECT, UNSETTLED, Fram
 from thermostand.markers.noise import Noise, estimate_noise
 from thermostand.markers.target import Target
 from thermostand.recording.format.capture_restarts import find_restart_times, is_superseded
+from thermostand.recording.format.manifest import Manifest, read_manifest
 from thermostand.recording.format.utc_offsets import UtcOffsets
 from thermostand.recording.reading.session import Say, Session, open_whole
 
@@ -102,7 +103,7 @@ class SessionFacts:
     not say. incomplete: segments that a killed recorder left behind and that were not read. utc: from its instants to
     UTC. spots: what a thermal imager saw of the camera, name -> (time_ns, degC). suspect: frames that the noise model
     does not describe, so that the covariance of their centres is an estimate (markers.Detection). uid: of the session
-    alone."""
+    alone. sha256: of its manifest, which has those of all its files; "" where there is none."""
 
     session_id: str
     recipe: str
@@ -117,6 +118,7 @@ class SessionFacts:
     )
     uid: str = ""
     suspect: int = 0
+    sha256: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -383,6 +385,7 @@ def _collect_facts(session: Session, suspect: int) -> SessionFacts:
     fields = ("session_id", "recipe", "operator", "software_version")
     texts = {name: session.metadata.get(name, "") for name in fields} | {"camera_serial": read_serial(session)}
     simulated = {"true": True, "false": False}.get(session.metadata.get("simulated", ""))
+    manifest = read_manifest(session.path)
     return SessionFacts(
         **texts,
         simulated=simulated,
@@ -391,6 +394,7 @@ def _collect_facts(session: Session, suspect: int) -> SessionFacts:
         spots=_read_spots(session),
         suspect=suspect,
         uid=session.metadata.get("uid", ""),
+        sha256=manifest.sha256 if isinstance(manifest, Manifest) else "",
     )
 
 

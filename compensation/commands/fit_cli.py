@@ -24,7 +24,7 @@ from thermostand.compensation.commands.options import (
 )
 from thermostand.compensation.datasheet.datasheet import compute_datasheet
 from thermostand.compensation.datasheet.measurement_details import load_details
-from thermostand.compensation.drift.bumps import Cause, find_unrepeated
+from thermostand.compensation.drift.bumps import MOST_STEPS, Cause, find_unrepeated, list_sessions_at_limit
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate, format_table
 from thermostand.compensation.drift.model_facts import Bump
@@ -194,6 +194,10 @@ def fit(
     named = [one for one in unrepeated if one.cause is not Cause.NOTHING]
     data = {"model": out, "form": model.form, "title": model.title, "bumps": [each.model_dump() for each in bumps]}
     stepped = [_format_bump(each, observations) for each in bumps]
+    stepped += [
+        f"{session_id}: {MOST_STEPS} steps were found, as many as are looked for; there may be more"
+        for session_id in list_sessions_at_limit(bumps)
+    ]
     stepped += [f"{one.session_id}: {one.text}" for one in named]
     repeats = model.between_sessions if isinstance(model, ThermalModel) else None
     stepped += [] if repeats is None else [repeats.text]
@@ -256,6 +260,7 @@ def _format_bump(bump: Bump, observations: Observations) -> str:
 def _describe_scores(evaluation: Evaluation) -> dict[str, object]:
     """Return what compensation gains, for programs; RMS along x and y, px."""
     return {
+        "question": evaluation.question,
         "method": evaluation.method,
         "frames": evaluation.frames,
         "rms_before_px": evaluation.rms_before_px,

@@ -6,6 +6,7 @@ All frames that show the target in its place are looked at: visits, warm-ups, re
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -318,7 +319,7 @@ _LEAST_PX, _LEAST_MARKER_PX = 0.035, 0.020
 _BLURRED = 0.5
 """How small a step may look amidst an instant."""
 # A bound of the time: each step costs a scan. Round number; nothing was measured.
-_MOST = 6
+MOST_STEPS = 6
 
 
 def find_bumps(observations: Observations) -> tuple[Bump, ...]:
@@ -333,6 +334,12 @@ def find_bumps(observations: Observations) -> tuple[Bump, ...]:
             found += sorted(_find_rigid_bumps(series), key=lambda bump: bump.after_ns)
             found += sorted(_find_marker_bumps(series), key=lambda bump: bump.after_ns)
     return tuple(found)
+
+
+def list_sessions_at_limit(bumps: Sequence[Bump]) -> tuple[str, ...]:
+    """List the sessions in which as many steps of the whole image were found as are looked for: there may be more."""
+    found = Counter(bump.session_id for bump in bumps if bump.marker is None)
+    return tuple(session_id for session_id, count in found.items() if count >= MOST_STEPS)
 
 
 def correct_bumps(observations: Observations, bumps: tuple[Bump, ...]) -> Observations:
@@ -366,7 +373,7 @@ def _find_rigid_bumps(series: SessionSeries) -> Iterator[Bump]:
     together. Where one is found the series is looked at minute by minute: a step amidst an instant looks like two
     halves."""
     before_ns: list[int] = []
-    while len(before_ns) < _MOST:
+    while len(before_ns) < MOST_STEPS:
         best, size_px = _find_largest_step(series, series.find_instants(before_ns))
         finer = series.refine(best)
         if size_px < _LEAST_PX * (1.0 if finer is series else _BLURRED):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,8 @@ class Evaluation:
 
     Attributes
     ----------
+    question
+        Whether the frames are of a session that was fitted.
     method
         What was held out, in words.
     frames
@@ -70,6 +73,7 @@ class Evaluation:
         Whether the frames are known to be of a simulated laboratory.
     """
 
+    question: Literal["same session, interpolated", "another session"]
     method: str
     held_out: bool
     frames: int
@@ -131,7 +135,9 @@ def evaluate(model: DriftModel, observations: Observations) -> Evaluation:
     at_rows = states.where(rows.frame)
     own = model.of_sessions(session.session_id for session in observations.sessions)
     claimed = np.diagonal(own.covariance(rows.measured_px, at_rows), axis1=1, axis2=2) + rows.variance_px2
+    is_fitted = {one.session_id for one in observations.sessions} <= set(model.facts.session_ids)
     return Evaluation(
+        question="same session, interpolated" if is_fitted else "another session",
         method=method,
         held_out=bool(frames.any()),
         frames=len(np.unique(rows.frame)),
@@ -212,7 +218,7 @@ def format_table(evaluation: Evaluation) -> str:
         f"{'':<{width}}" + 2 * f"{'before':>10}{'after':>10}{'gain':>8}  ",
         f"{'paper':<{width}}" + _format_cells(PAPER_BEFORE_PX, PAPER_AFTER_PX),
         f"{name:<{width}}" + _format_cells(evaluation.rms_before_px, evaluation.rms_after_px),
-        f"{evaluation.frames} frames; {evaluation.method}",
+        f"{evaluation.frames} frames; {evaluation.question}; {evaluation.method}",
     ]
     return "\n".join(line.rstrip() for line in lines)
 

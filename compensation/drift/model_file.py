@@ -105,7 +105,8 @@ class ThermalFile(_File):
     that was not fitted adds, null where that is not known; with sessions_compared 0 it was assumed, not measured.
     claim_factors: what the covariance is multiplied by in a session that was fitted, in another one, of a camera in its
     first hour with and without a warm-up that was fitted, and beyond the calibrated temperatures; claim_least_px: the
-    least uncertainty, along I and J."""
+    least uncertainty, along I and J. prior_px (8, H): standard deviations of the coefficients before anything was
+    seen."""
 
     form: Literal["thermal"] = "thermal"
     terms: tuple[_Term, ...]
@@ -124,6 +125,7 @@ class ThermalFile(_File):
     sessions_compared: Annotated[int, Field(ge=0)]
     claim_factors: Annotated[tuple[NotNegative, ...], Field(min_length=len(Question), max_length=len(Question))]
     claim_least_px: Spread
+    prior_px: Rows | None = None
     other: PaperFile | None = None
 
 
@@ -233,6 +235,7 @@ def _list_thermal_fields(model: ThermalModel) -> dict[str, object]:
         "sessions_compared": 0 if model.between_sessions is None else model.between_sessions.sessions,
         "claim_factors": model.claims.factors,
         "claim_least_px": model.claims.least_px,
+        "prior_px": None if model.prior_px is None else model.prior_px.tolist(),
     }
 
 
@@ -297,6 +300,7 @@ def _build_thermal_model(file: ThermalFile) -> ThermalModel:
         if file.between_sessions_px is None
         else BetweenSessions(file.between_sessions_px, file.sessions_compared),
         claims=Claims(file.claim_factors, file.claim_least_px),
+        prior_px=None if file.prior_px is None else check_shape("prior_px", file.prior_px, (MOTIONS, count)),
     )
 
 

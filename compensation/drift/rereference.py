@@ -198,5 +198,11 @@ def _condition_on_reference(
     factors = model.claims.factors
     claims = replace(model.claims, factors=(factors[Question.ANOTHER], *factors[1:]))
     return replace(
-        model, facts=facts, coefficients=coefficients, coefficient_covariance=covariance, claims=claims, other=None
+        model,
+        facts=facts,
+        coefficients=coefficients,
+        coefficient_covariance=covariance,
+        claims=claims,
+        other=None,
+        prior_px=None,
     )

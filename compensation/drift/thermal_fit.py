@@ -83,11 +83,13 @@ class _Hyperparameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """coefficients (8, H), px, and their covariance (8, H, H), px^2. ou_noise_px2 (8,): variance of what wanders."""
+    """coefficients (8, H), px, and their covariance (8, H, H), px^2. prior_px (8, H): standard deviation of each before
+    anything was seen. ou_noise_px2 (8,): variance of what wanders."""
 
     instants: Instants
     coefficients: Float
     covariance: Float
+    prior_px: Float
     ou_noise_px2: Float
     _scale_px: Float
     _hyperparameters: tuple[_Hyperparameters, ...]
@@ -132,6 +134,7 @@ def fit_posterior(instants: Instants, terms: Sequence[Term]) -> Posterior:
         instants,
         np.array([coefficients for coefficients, _ in solved]) * scale_px[:, None],
         np.array([covariance for _, covariance in solved]) * scale_px[:, None, None] ** 2,
+        np.array([own.widths for own in believed]) * scale_px[:, None],
         np.array([(own.noise * own.weighting.ou_noise) ** 2 for own in believed]) * scale_px**2,
         scale_px,
         believed,
@@ -343,6 +346,7 @@ def _make_model(taught: _ThermalFit, heating_K: float) -> ThermalModel:
         has_warm_up=bool(trained.observations.of(Role.WARM_UP).any()),
         candidates=(_make_candidate(taught),),
         claims=claims,
+        prior_px=learned.prior_px,
         between_sessions=BetweenSessions(_compute_more_px(taught, claims), len(sessions)),
     )
     largest = float(found.compute_leverage(trained.states.where(np.unique(trained.rows.frame))).max())

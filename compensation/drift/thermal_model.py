@@ -49,6 +49,19 @@ class ThermalRange:
     history_s: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class TermGroup:
+    """Terms whose coefficients have one prior width for each motion. coefficients: how many, of all motions; effective:
+    how many of them the data determine. prior_px, posterior_px: RMS standard deviation of those of the shift along I
+    and J, before and after the data."""
+
+    name: str
+    coefficients: int
+    effective: float
+    prior_px: Pair
+    posterior_px: Pair
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ThermalModel(DriftModel):
     """terms: H features of the thermal state. coefficients (8, H) px, each motion's with a covariance (8, H, H) px^2:
@@ -58,7 +71,8 @@ class ThermalModel(DriftModel):
     reference_ambient_degC: of the air near the camera at the reference. reference_features (H,): subtracted, so that
     the shift at the reference is about 0. discrepancy_px: at set-points that were left out. between_sessions: what is
     claimed beyond that in another session; None of sessions that were fitted, and where both are the same.
-    has_warm_up: whether a warm-up was among the training frames.
+    has_warm_up: whether a warm-up was among the training frames. prior_px (8, H): standard deviations of the
+    coefficients before anything was seen, as the evidence has them; None where there was no such prior.
     """
 
     form = "thermal"
@@ -73,12 +87,36 @@ class ThermalModel(DriftModel):
     has_warm_up: bool
     between_sessions: BetweenSessions | None = None
     claims: Claims = field(default_factory=Claims)
+    prior_px: Float | None = None
 
     @property
     def title(self) -> str:
         """The form in words."""
         without = "" if self.has_warm_up else "; no warm-up was recorded"
         return f"{format_form_name(self.terms)}, {self.coefficients.size} coefficients{without}"
+
+    @property
+    def groups(self) -> tuple[TermGroup, ...]:
+        """What was learned of the terms of each width; empty where no prior is known."""
+        if self.prior_px is None:
+            return ()
+        posterior_px2 = np.diagonal(self.coefficient_covariance, axis1=1, axis2=2)
+        learned = np.clip(1 - posterior_px2 / self.prior_px**2, 0.0, 1.0)
+        found: list[TermGroup] = []
+        for width in dict.fromkeys(term.width for term in self.terms):
+            own = np.array([term.width == width for term in self.terms])
+            prior_px, posterior_px = (
+                np.sqrt(squares[:, own].mean(axis=1)) for squares in (self.prior_px**2, posterior_px2)
+            )
+            shifts = [(float(each[0]), float(each[1])) for each in (prior_px, posterior_px)]
+            found.append(TermGroup(width, int(own.sum()) * len(prior_px), float(learned[:, own].sum()), *shifts))
+        return tuple(found)
+
+    @property
+    def effective_parameters(self) -> float:
+        """How many coefficients the data determine (MacKay, Bayesian interpolation, 1992): the sum of 1 - posterior
+        over prior variance; NaN where no prior is known."""
+        return sum(group.effective for group in self.groups) if self.groups else math.nan
 
     @property
     def memory(self) -> ThermalStateSpec:

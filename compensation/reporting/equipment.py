@@ -110,6 +110,11 @@ def list_stated_details(details: MeasurementDetails, target: Target) -> list[Lin
         ("Target", _describe_target(target)),
         ("Target certificate", details.target_certificate),
         ("Thermometer certificate", details.thermometer_certificate),
+        (
+            "Thermometers' uncertainty",
+            f"air near the camera {details.u_air_K:g} K, standard uncertainty with its place, "
+            f"{'as stated' if details.states_u_air else 'assumed'}",
+        ),
         ("Places of the sensors", "; ".join(f"{name}: {place}" for name, place in details.sensor_positions.items())),
     ]
     if details.laboratory:

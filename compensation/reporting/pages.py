@@ -23,6 +23,7 @@ from thermostand.compensation.calibration.calibrate import CameraCalibration
 from thermostand.compensation.calibration.camera_file import CameraFile
 from thermostand.compensation.certificate.certificate import Certificate, Conformity
 from thermostand.compensation.datasheet.datasheet import COVERAGE, Datasheet, MeasuredQuantity
+from thermostand.compensation.drift.bumps import list_sessions_at_limit
 from thermostand.compensation.drift.drift_model import Outside
 from thermostand.compensation.drift.evaluation import compute_improvement_percent
 from thermostand.compensation.reporting.drawing import page_figures
@@ -68,7 +69,12 @@ def _make_environment() -> Environment:
         keep_trailing_newline=True,
     )
     made.filters.update(_FILTERS)
-    names: dict[str, Any] = {"paper": document, "flagged": describe_flags, "reasons": _list_reasons}
+    names: dict[str, Any] = {
+        "paper": document,
+        "flagged": describe_flags,
+        "reasons": _list_reasons,
+        "sessions_at_limit": list_sessions_at_limit,
+    }
     made.globals.update(names)
     return made
 
@@ -111,6 +117,7 @@ _FILTERS: dict[str, Any] = {
     "fine": lambda value, limit, digits: f"{value:z.{digits + (value < limit)}f}",
     "gain": lambda before, after, digits=1: format_percent(compute_improvement_percent(before, after), digits),
     "mpx": format_mpx,
+    "in_mm": lambda pair, mm_per_px: format_significant(math.hypot(*pair) * mm_per_px, 2),
     "percent": format_percent,
     "measured": lambda value, expanded: [*format_with_expanded_uncertainty(value, expanded)],
     "significant": format_significant,

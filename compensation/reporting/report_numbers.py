@@ -9,9 +9,12 @@ import importlib.metadata
 import json
 import math
 import re
+import shlex
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +23,7 @@ from thermostand.compensation.calibration.session_centres import list_visits
 from thermostand.compensation.datasheet.measurement_details import MeasurementDetails
 from thermostand.compensation.drift.bumps import UnrepeatedMotion, correct_bumps, find_bumps, find_unrepeated
 from thermostand.compensation.drift.candidates import Candidate, compute_rms_px, make_pair
-from thermostand.compensation.drift.displacements import compute_displacements
+from thermostand.compensation.drift.displacements import average_reference_centres, compute_displacements
 from thermostand.compensation.drift.drift_model import DriftModel
 from thermostand.compensation.drift.evaluation import (
     PAPER_AFTER_PX,
@@ -28,11 +31,12 @@ from thermostand.compensation.drift.evaluation import (
     Evaluation,
     TemperatureRms,
     compute_improvement_percent,
+    evaluate,
 )
 from thermostand.compensation.drift.hysteresis import Hysteresis, compute_hysteresis
 from thermostand.compensation.drift.model_facts import Bump
-from thermostand.compensation.drift.paper_model import PaperModel, list_exponents
-from thermostand.compensation.drift.thermal_model import ThermalModel
+from thermostand.compensation.drift.paper_model import PaperModel, fit_paper, list_exponents
+from thermostand.compensation.drift.thermal_model import TermGroup, ThermalModel
 from thermostand.compensation.drift.training_data import compute_frame_states
 from thermostand.compensation.expression import SPAN_K
 from thermostand.compensation.observations import Float, Mask, Observations
@@ -41,8 +45,10 @@ from thermostand.compensation.reporting.tracks import WarmUpTrack, find_warm_ups
 from thermostand.compensation.validation3d.document import serialise_validation as validation_json
 from thermostand.compensation.validation3d.validate import SpatialValidation
 from thermostand.experiments.steps import Role
+from thermostand.foundation.errors import SessionError
 from thermostand.foundation.items import StepMark
 from thermostand.foundation.json_values import make_plain
+from thermostand.foundation.version import read_commit
 from thermostand.markers.detection import Flag
 
 FORMAT = "thermostand report 1"
@@ -59,8 +65,8 @@ class TablePositions:
 
 @dataclass(frozen=True, slots=True)
 class SessionNumbers:
-    """frames_by_role, flags: how many of each. centres: in usable frames; excluded: of them, with a flag.
-    suspect: frames that the noise model does not describe."""
+    """frames_by_role, flags: how many of each. centres: in usable frames; set_aside: of them, with a flag.
+    suspect: frames that the noise model does not describe. sha256: of the session's manifest."""
 
     session_id: str
     recipe: str
@@ -79,6 +85,7 @@ class SessionNumbers:
     excluded: int
     flags: dict[str, int]
     suspect: int
+    sha256: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +117,16 @@ class WarmUpNumbers:
 
 @dataclass(frozen=True, slots=True)
 class ScoreNumbers:
-    """RMS deviations before and after. marker_sigma_px: RMS standard uncertainty of a measured deviation without a
-    model. claimed_sigma_px: of a compensated one, as model and markers claim it. coverage_95: part of the deviations in
-    the 95 % interval. outside: part of the centres beyond the model's valid range."""
+    """RMS deviations before and after. question: what the model was asked. mm_per_px: at the target, by which the
+    deviations are the paper's of figure 12, in mm. marker_sigma_px: RMS standard uncertainty of a measured deviation
+    without a model. claimed_sigma_px: of a compensated one, as model and markers claim it. coverage_95: part of the
+    deviations in the 95 % interval. outside: part of the centres beyond the model's valid range."""
 
+    question: str
     method: str
     frames: int
     centres: int
+    mm_per_px: float
     before_px: Pair
     after_px: Pair
     gain_percent: Pair
@@ -160,7 +170,8 @@ class FormulaNumbers:
 @dataclass(frozen=True, slots=True)
 class ModelNumbers:
     """candidates: every form tried, with its errors at temperatures left out. between_sessions_px: what a session that
-    was not fitted adds, None where that is not known; with sessions_compared 0 it was assumed, not measured."""
+    was not fitted adds, None where that is not known; with sessions_compared 0 it was assumed, not measured.
+    effective_parameters: how many coefficients the data determine, groups: of each kind of term."""
 
     form: str
     title: str
@@ -175,13 +186,35 @@ class ModelNumbers:
     software_version: str
     formula: FormulaNumbers
     candidates: tuple[Candidate, ...]
+    effective_parameters: float
+    groups: tuple[TermGroup, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PaperFormNumbers:
+    """The paper's polynomial of degree 4, fitted to the same frames: what it gains at the same held-out temperatures,
+    and its formula."""
+
+    degree: int
+    score: ScoreNumbers
+    formula: FormulaNumbers
+
+
+@dataclass(frozen=True, slots=True)
+class ProvenanceNumbers:
+    """What made the report. commit: of the program, "" where it is not known. command: the line it was called by."""
+
+    version: str
+    commit: str
+    command: str
 
 
 @dataclass(frozen=True, slots=True)
 class ReportNumbers:
     """The whole of it; model, score: None without one. hysteresis: before compensation and, with a model, after.
     measured_with: as recorded and as stated. budgets: the stand's, by session id. positions: of the table. validation:
-    as `compensate validate` writes it, None without one. paper: its figures, px."""
+    as `compensate validate` writes it, None without one. paper: its figures, px. paper_form: None where the frames do
+    not support it."""
 
     format: str
     versions: dict[str, str]
@@ -203,6 +236,8 @@ class ReportNumbers:
     unrepeated: tuple[UnrepeatedMotion, ...]
     validation: object
     paper: dict[str, Pair]
+    paper_form: PaperFormNumbers | None
+    made_by: ProvenanceNumbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +255,9 @@ class Extras:
 PAPER_WARM_UP_PX = (0.3, 1.1)
 """Mean drift of the paper's camera, not modified, while it warmed itself by 20 K at 24 degC (section 3.1)."""
 
+PAPER_DEGREE = 4
+"""Of its polynomial (section 6.2)."""
+
 _LIBRARIES = ("thermostand", "numpy", "scipy", "opencv-python-headless", "matplotlib")
 
 
@@ -233,6 +271,7 @@ def collect_numbers(
     extras = extras or Extras()
     validation = extras.validation
     bumps = find_bumps(observations) if model is None else model.facts.bumps
+    mm_per_px = _compute_mm_per_px(observations)
     return ReportNumbers(
         format=FORMAT,
         versions={name: importlib.metadata.version(name) for name in _LIBRARIES},
@@ -244,7 +283,7 @@ def collect_numbers(
         sessions=tuple(_summarise_session(observations, index) for index in range(len(observations.sessions))),
         unusable=tuple(_list_unusable(observations)),
         warm_ups=tuple(_summarise_warm_up(observations, one, model) for one in find_warm_ups(observations)),
-        score=None if evaluation is None else _summarise_score(evaluation),
+        score=None if evaluation is None else _summarise_score(evaluation, mm_per_px),
         hysteresis_before=compute_hysteresis(observations),
         hysteresis_after=() if model is None else compute_hysteresis(observations, model),
         model=None if model is None else _describe_model(model),
@@ -254,7 +293,40 @@ def collect_numbers(
         unrepeated=find_unrepeated(observations, bumps),
         validation=None if validation is None else json.loads(validation_json(validation)),
         paper={"before_px": PAPER_BEFORE_PX, "after_px": PAPER_AFTER_PX, "warm_up_px": PAPER_WARM_UP_PX},
+        paper_form=None if model is None or evaluation is None else _score_paper_form(observations, model, mm_per_px),
+        made_by=ProvenanceNumbers(
+            importlib.metadata.version("thermostand"),
+            read_commit(),
+            shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        ),
     )
+
+
+def _compute_mm_per_px(observations: Observations) -> float:
+    """At the target, of its markers at the reference: the root of the ratio of their scatters."""
+    centres_px = average_reference_centres(observations)[0]
+    places_px = centres_px[np.isfinite(centres_px).any(axis=(1, 2))]
+    if not len(places_px):
+        return math.nan
+    seen = np.isfinite(places_px[0]).all(axis=1)
+    scatter = [
+        float(((places - places.mean(axis=0)) ** 2).sum())
+        for places in (observations.target.coordinates_mm()[seen], places_px[0][seen])
+    ]
+    return math.sqrt(scatter[0] / scatter[1]) if scatter[1] > 0 else math.nan
+
+
+def _score_paper_form(observations: Observations, model: DriftModel, mm_per_px: float) -> PaperFormNumbers | None:
+    """None of a session that the model was not fitted to: its own frames would teach the polynomial what they ask."""
+    if not {one.session_id for one in observations.sessions} <= set(model.facts.session_ids):
+        return None
+    try:
+        paper = fit_paper(correct_bumps(observations, model.facts.bumps), PAPER_DEGREE)
+        paper = replace(paper, facts=replace(paper.facts, bumps=model.facts.bumps))
+        score = _summarise_score(evaluate(paper, observations), mm_per_px)
+    except SessionError:
+        return None
+    return PaperFormNumbers(PAPER_DEGREE, score, describe_formula(paper))
 
 
 def _list_bumps(observations: Observations, bumps: Sequence[Bump]) -> Iterator[BumpNumbers]:
@@ -291,6 +363,7 @@ def _summarise_session(observations: Observations, index: int) -> SessionNumbers
         excluded=int(np.count_nonzero(flags)),
         flags={flag: count for flag, count in by_flag.items() if count},
         suspect=facts.suspect,
+        sha256=facts.sha256,
     )
 
 
@@ -348,12 +421,14 @@ def _compute_warm_up_residual_px(observations: Observations, one: WarmUpTrack, m
     return compute_rms_px(known) if len(known) else (math.nan, math.nan)
 
 
-def _summarise_score(evaluation: Evaluation) -> ScoreNumbers:
+def _summarise_score(evaluation: Evaluation, mm_per_px: float) -> ScoreNumbers:
     before, after = evaluation.rms_before_px, evaluation.rms_after_px
     return ScoreNumbers(
+        question=evaluation.question,
         method=evaluation.method,
         frames=evaluation.frames,
         centres=len(evaluation.after_px),
+        mm_per_px=mm_per_px,
         before_px=before,
         after_px=after,
         gain_percent=(
@@ -385,6 +460,10 @@ def _describe_model(model: DriftModel) -> ModelNumbers:
         software_version=facts.software_version,
         formula=describe_formula(model),
         candidates=model.candidates,
+        effective_parameters=model.effective_parameters
+        if isinstance(model, ThermalModel)
+        else float(describe_formula(model).coefficients_px.size),
+        groups=model.groups if isinstance(model, ThermalModel) else (),
     )
 
 

@@ -108,10 +108,15 @@ class Manifest:
     ended: bool = False
     remade: bool = False
 
+    @property
+    def sha256(self) -> str:
+        """The hash of all it lists, and so of the whole session."""
+        return _compute_sha256({"format": FORMAT, **asdict(self)})
+
     def encode(self) -> bytes:
         """The file; the same of the same contents."""
-        fields = {"format": FORMAT, **asdict(self)}
-        return json.dumps({**fields, "sha256": _compute_sha256(fields)}, indent=1, sort_keys=True).encode() + b"\n"
+        fields = {"format": FORMAT, **asdict(self), "sha256": self.sha256}
+        return json.dumps(fields, indent=1, sort_keys=True).encode() + b"\n"
 
     def add_segment(self, name: str, sealed: Sealed) -> Manifest:
         """Return the manifest with that segment more, or with it as it is now."""

@@ -98,14 +98,14 @@ def test_the_table_is_shown_with_the_papers(seen: Observations, model: PaperMode
         "                  before     after    gain      before     after    gain",
         "paper              0.191     0.100    48 %       0.576     0.090    84 %",
         "this session       0.200     0.010    95 %       0.500     0.050    90 %",
-        "12 frames; held-out temperatures",
+        "12 frames; same session, interpolated; held-out temperatures",
     ]
     assert format_table(replace(exact, simulated=True)).splitlines()[1:] == [
         "                                             along I                       along J",
         "                              before     after    gain      before     after    gain",
         "paper                          0.191     0.100    48 %       0.576     0.090    84 %",
         "this session (simulated)       0.200     0.010    95 %       0.500     0.050    90 %",
-        "12 frames; held-out temperatures",
+        "12 frames; same session, interpolated; held-out temperatures",
     ]
 
 

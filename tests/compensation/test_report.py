@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import pytest
 
 from thermostand.compensation.budget.budget import Budget, BudgetLine
 from thermostand.compensation.budget.geometry import ThermometerState
+from thermostand.compensation.drift.bumps import MOST_STEPS
 from thermostand.compensation.drift.evaluation import Evaluation, evaluate
 from thermostand.compensation.drift.paper_model import PaperModel, fit_paper
 from thermostand.compensation.drift.terms import compute_features
@@ -38,10 +40,12 @@ from thermostand.compensation.reporting.report import (
     write_report,
 )
 from thermostand.compensation.reporting.report_numbers import (
+    BumpNumbers,
     Extras,
     ReportNumbers,
     collect_numbers,
     describe_formula,
+    format_significant,
     serialise_numbers,
 )
 from thermostand.compensation.reporting.tracks import (
@@ -580,3 +584,46 @@ def test_what_a_thermal_imager_saw_stands_beneath_the_drift():
     assert 0.99 * hours < shown[-1] <= hours
     assert [text.get_text() for text in foot.get_legend().get_texts()][:2] == ["lens", "back"]
     assert foot.get_ylabel() == "thermal imager (°C)"
+
+
+# What made the report, and what the paper's own polynomial does with the same frames.
+
+
+def test_the_report_names_the_program_its_command_and_the_session_s_hash(numbers: ReportNumbers):
+    made, (session, *_) = numbers.made_by, numbers.sessions
+    own = replace(
+        numbers,
+        made_by=replace(made, version="9.8.7", commit="0123abcd4567", command="compensate report a/b -o 'c d.html'"),
+        sessions=(replace(session, sha256=64 * "e"),),
+    )
+    page = render_numbers(own)
+    for text in ("thermostand 9.8.7, commit 0123abcd4567", "compensate report a/b -o &#39;c d.html&#39;", 64 * "e"):
+        assert text in page
+    assert "no manifest" in render_numbers(numbers)
+    assert "commit" not in render_numbers(replace(own, made_by=replace(own.made_by, commit="")))
+
+
+def test_the_paper_s_degree_stands_with_its_own_gain_formula_and_mm(numbers: ReportNumbers, analysed: Analysed):
+    observations, _, evaluation = analysed
+    paper = numbers.paper_form
+    assert paper is not None
+    assert (paper.degree, len(paper.formula.terms)) == (4, 35)
+    assert paper.score.before_px == evaluation.rms_before_px
+    own = evaluate(fit_paper(observations, 4), observations)
+    np.testing.assert_allclose(paper.score.after_px, own.rms_after_px, rtol=1e-9)
+    spread = [np.ptp(each[:, 0]) for each in (observations.target.coordinates_mm(), observations.centres_px[0])]
+    assert paper.score.mm_per_px == pytest.approx(spread[0] / spread[1], rel=0.01)
+    (first, *_), page = paper.score.temperatures, render_numbers(numbers)
+    assert f"<td>{format_significant(math.hypot(*first.after_px) * paper.score.mm_per_px, 2)}</td>" in page
+    assert "P4 after, mm" in page
+    assert paper.score.question == "same session, interpolated"
+
+
+def test_a_session_with_as_many_steps_as_are_looked_for_may_have_more(numbers: ReportNumbers):
+    one = BumpNumbers(
+        "night-1", "2026-01-01T00:00:00", "2026-01-01T00:01:00", 0, 1, (0.1,) * 4, (0.01,) * 4, None, "moved"
+    )
+    said = "as many steps were found as are looked for"
+    assert said in render_numbers(replace(numbers, bumps=(one,) * MOST_STEPS))
+    assert said not in render_numbers(replace(numbers, bumps=(one,) * (MOST_STEPS - 1)))
+    assert said not in render_numbers(replace(numbers, bumps=(replace(one, marker=3),) * MOST_STEPS))

@@ -225,3 +225,23 @@ def test_a_session_that_only_one_form_can_be_fitted_to_has_that_form_and_says_wh
     assert sentence.startswith("the paper form")
     with pytest.raises(SessionError, match="at 3 chamber temperatures"):
         fit(observed, form="paper")
+
+
+def test_the_effective_parameters_are_fewer_than_the_coefficients_and_no_more_than_the_data(
+    recorded: Seen, thermal: ThermalModel
+):
+    groups = {group.name: group for group in thermal.groups}
+    assert sum(group.coefficients for group in groups.values()) == thermal.coefficients.size
+    assert 8 < thermal.effective_parameters < 0.5 * thermal.coefficients.size
+    instants = len(np.unique(np.array(recorded[0].step_id)[recorded[0].of(Role.REFERENCE, Role.FIT, Role.WARM_UP)]))
+    assert thermal.effective_parameters < 8 * (instants + len(np.flatnonzero(recorded[0].of(Role.WARM_UP))))
+    for group in groups.values():
+        assert 0 <= group.effective <= group.coefficients
+        assert all(after <= before for before, after in zip(group.prior_px, group.posterior_px, strict=True))
+    assert groups["camera"].effective / groups["camera"].coefficients > 0.3
+
+
+def test_a_model_without_a_prior_has_no_effective_parameters(thermal: ThermalModel):
+    bare = replace(thermal, prior_px=None)
+    assert bare.groups == ()
+    assert np.isnan(bare.effective_parameters)
