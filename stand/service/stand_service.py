@@ -308,19 +308,19 @@ class StandService(Served):
         self.host.wake()
         return orders.describe_run(entry)
 
-    @command("/recipes/{recipe}", http="PUT", verbs=(), by_secop=None, title="Save as a recipe")
+    @command("/own-recipes/{recipe}", http="PUT", verbs=(), by_secop=None, title="Save as a recipe")
     async def save_recipe(self, who: Requester, given: SaveRequest) -> str:
         """Save a recipe of your own beside the sessions, in the place of one of that name; installed ones stay."""
         await self._require_queue().save_recipe(given.recipe, given.recipe_text)
         return f"saved as {given.recipe}"
 
-    @command("/recipes/{recipe}", http="DELETE", verbs=(), by_secop=None, title="Remove this recipe")
+    @command("/own-recipes/{recipe}", http="DELETE", verbs=(), by_secop=None, title="Remove this recipe")
     async def remove_recipe(self, who: Requester, given: RecipeRequest) -> str:
         """Remove a recipe of your own; runs that were queued with it stay as they are."""
         await self._require_queue().remove_recipe(given.recipe)
         return f"the recipe {given.recipe} is removed"
 
-    @command("/recipes/rehearse", verbs=(), by_secop=None)
+    @command("/rehearsals", verbs=(), by_secop=None)
     async def rehearse(self, who: Requester, given: RunRequest) -> str:
         """Run a recipe in virtual time, in a simulated laboratory. Nothing of this stand moves; the session is in the
         list, marked as simulated, when it is done."""

@@ -5,27 +5,21 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncGenerator, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pydantic import JsonValue
 
 from thermostand.experiments.steps import Soak, number_steps
 from thermostand.foundation.clock import WallClock
-from thermostand.foundation.documents import Document, parse_document
+from thermostand.foundation.documents import Document
 from thermostand.foundation.hub import Hub
 from thermostand.foundation.items import Batch, Event
 from thermostand.foundation.readings import Reading, bad_reading
 from thermostand.foundation.shutdown_deadline import ShutdownDeadline
-from thermostand.stand.config.own_recipes import read_recipe, remove_recipe, save_recipe
-from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.memory.state import RunState
-from thermostand.stand.running.order import load_order
 from thermostand.stand.running.run_control import check_edit
 from thermostand.stand.safety.gate import INTERLOCK, OPERATOR, Gate
-from thermostand.stand.service.run_preview import Turn, preview_order
 from thermostand.stand.service.stand_service import (
     CancelRequest,
     DeviceRequest,
@@ -168,25 +162,15 @@ class FakeService(StandService):
         return check_edit(RunState(plan), from_index, steps, load_config(find_packaged("", "simulated")))
 
     async def preview(self, request: RunRequest) -> RunPreview:
-        """On the simulated stand, behind what is queued."""
-        text = request.recipe_text or read_recipe(self.sessions, request.recipe)
-        waiting = sum(each.state == "waiting" for each in self.queue)
-        turn = Turn("queued", waiting, None) if waiting else Turn("now", 0, self.clock.now_ns())
-        return preview_order(replace(load_order("demo", "simulated"), **self._parse(text)), self.sessions, turn, ())
+        raise Conflict("no queue is kept here")
 
-    def _parse(self, text: str) -> dict[str, Any]:
-        return {"recipe_text": text, "recipe": parse_document(text, Recipe, "the recipe")}
-
-    async def save_recipe(self, who: Requester, given: SaveRequest) -> str:
-        save_recipe(str(self.sessions), given.recipe, given.recipe_text)
+    async def save_recipe(self, who: Who, given: SaveRequest) -> str:
         return f"saved as {given.recipe}"
 
-    async def remove_recipe(self, who: Requester, given: RecipeRequest) -> str:
-        remove_recipe(str(self.sessions), given.recipe)
-        return f"the recipe {given.recipe} is removed"
+    async def remove_recipe(self, who: Who, given: RecipeRequest) -> str:
+        raise Missing("no recipe of that name was saved here")
 
-    async def rehearse(self, who: Requester, given: RunRequest) -> str:
-        self.rehearsed = (await self.preview(given)).recipe
+    async def rehearse(self, who: Who, given: RunRequest) -> str:
         return "rehearsed"
 
     def devices(self) -> tuple[DeviceState, ...]:

@@ -8,7 +8,9 @@ import math
 import socket
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,16 +19,27 @@ from pydantic import JsonValue
 from tests.stand.fake_service import FakeService, serve_fake
 from thermostand.experiments.steps import PlannedStep, make_step
 from thermostand.foundation.clock import NS_PER_S, WallClock
+from thermostand.foundation.documents import parse_document
 from thermostand.foundation.items import Batch, Event, StepMark, StepState
 from thermostand.foundation.readings import Frame, Reading, bad_reading
 from thermostand.stand.config.interface_section import RemoteStand
+from thermostand.stand.config.own_recipes import read_recipe, remove_recipe, save_recipe
+from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import find_packaged, load_config
 from thermostand.stand.running.memory.entries import StepChanged as StepChanged
 from thermostand.stand.running.memory.fold import fold
+from thermostand.stand.running.order import load_order
 from thermostand.stand.running.run_control import check_edit
 from thermostand.stand.safety.fault import Fault
 from thermostand.stand.safety.gate import INTERLOCK, OPERATOR
-from thermostand.stand.service.stand_service import ExtendRequest, PauseRequest, SkipRequest
+from thermostand.stand.service.run_preview import Turn, preview_order
+from thermostand.stand.service.stand_service import (
+    ExtendRequest,
+    PauseRequest,
+    RecipeRequest,
+    SaveRequest,
+    SkipRequest,
+)
 from thermostand.stand.serving.api.listeners import Interface
 from thermostand.stand.serving.api_models import (
     Argument,
@@ -129,6 +142,28 @@ class CycleService(FakeService):
                 "disk_free_bytes": 812_000_000_000,
             }
         )
+
+    async def preview(self, request: RunRequest) -> RunPreview:
+        """On the simulated stand, behind what is queued."""
+        text = request.recipe_text or read_recipe(self.sessions, request.recipe)
+        waiting = sum(each.state == "waiting" for each in self.queue)
+        turn = Turn("queued", waiting, None) if waiting else Turn("now", 0, self.clock.now_ns())
+        return preview_order(replace(load_order("demo", "simulated"), **self._parse(text)), self.sessions, turn, ())
+
+    def _parse(self, text: str) -> dict[str, Any]:
+        return {"recipe_text": text, "recipe": parse_document(text, Recipe, "the recipe")}
+
+    async def save_recipe(self, who: Requester, given: SaveRequest) -> str:
+        save_recipe(str(self.sessions), given.recipe, given.recipe_text)
+        return f"saved as {given.recipe}"
+
+    async def remove_recipe(self, who: Requester, given: RecipeRequest) -> str:
+        remove_recipe(str(self.sessions), given.recipe)
+        return f"the recipe {given.recipe} is removed"
+
+    async def rehearse(self, who: Requester, given: RunRequest) -> str:
+        self.rehearsed = (await self.preview(given)).recipe
+        return "rehearsed"
 
     def plan(self) -> tuple[PlanStep, ...]:
         return tuple(self._step(index) for index in range(STEPS))

@@ -32,7 +32,7 @@ async def test_what_a_session_will_do_follows_what_is_typed(desk):
         await page.get_by_text("it begins at once").wait_for()
         assert await page.locator("div.course circle.capture").count() == len(before["course"]["captures"]) == 49
         await page.get_by_text("Look at and change its parameters").click()
-        async with page.expect_response("**/recipes/preview") as answer:
+        async with page.expect_response("**/previews") as answer:
             await page.get_by_label("soak, min", exact=True).fill("30")
         after = await (await answer.value).json()
         # 48 soaks of 15 min less.
@@ -41,7 +41,7 @@ async def test_what_a_session_will_do_follows_what_is_typed(desk):
             parse_document(after["recipe_text"], Recipe, "it").experiments[0].model_dump()["thermal_cycle"]["soak_s"]
             == 1800
         )
-        async with page.expect_response("**/recipes/preview") as answer:
+        async with page.expect_response("**/previews") as answer:
             await page.get_by_label("set points °C").fill("31, 75")
         assert (await answer.value).status == 422
         await page.locator(".lacks .error").wait_for()
@@ -52,7 +52,7 @@ async def test_a_level_is_moved_with_keys_and_by_dragging(desk):
     async with a_page(desk.chromium, desk.port, "queue", DESKTOP) as page:
         await choose(page, "thermal-desk")
         level = page.get_by_role("slider", name="set-point 48 °C")
-        async with page.expect_response("**/recipes/preview") as answer:
+        async with page.expect_response("**/previews") as answer:
             await level.press("ArrowUp")
         moved = (await (await answer.value).json())["recipe"]["experiments"][0]["thermal_cycle"]
         assert 48 not in moved["set_points_degC"]
@@ -63,7 +63,7 @@ async def test_a_level_is_moved_with_keys_and_by_dragging(desk):
         await page.mouse.move(box["x"] + 5, box["y"] + 6)
         await page.mouse.down()
         await page.mouse.move(box["x"] + 5, box["y"] - 10)
-        async with page.expect_response("**/recipes/preview") as answer:
+        async with page.expect_response("**/previews") as answer:
             await page.mouse.up()
         highest = max(
             (await (await answer.value).json())["recipe"]["experiments"][0]["thermal_cycle"]["set_points_degC"]
@@ -79,7 +79,7 @@ async def test_a_recipe_is_written_as_yaml_saved_rehearsed_and_removed(desk):
         await page.get_by_text("As YAML").click()
         text = page.get_by_label("The recipe as YAML")
         await expect(text).to_have_value(re.compile("thermal_cycle"))
-        async with page.expect_response("**/recipes/preview"):
+        async with page.expect_response("**/previews"):
             await text.fill(
                 (await text.input_value()).replace("name: demo", "name: mine").replace("frames: 16", "frames: 17")
             )

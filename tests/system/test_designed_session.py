@@ -14,29 +14,29 @@ __all__ = ["serve"]
 def test_a_design_is_previewed_saved_rehearsed_and_removed(serve):
     served = serve()
     served.until(is_idle)
-    seen = served.post("recipes/preview", recipe_text=BRIEF)
+    seen = served.post("previews", recipe_text=BRIEF)
     assert (seen["begins"], seen["ahead"], seen["steps"], seen["lacks"]) == ("now", 0, 3, [])
     assert seen["recipe"]["steps"] == [{"start_chamber": 26}, {"soak": 0.5}, "stop_chamber"]
     assert served.state().queue == ()  # nothing was queued
 
-    put = served.server.request("PUT", "/api/v1/recipes/brief", {"recipe_text": BRIEF}, 20.0)
+    put = served.server.request("PUT", "/api/v1/own-recipes/brief", {"recipe_text": BRIEF}, 20.0)
     assert put["verb"] == "save_recipe"
     for name, text in (("other", BRIEF), ("demo", BRIEF.replace("brief", "demo")), ("brief", "steps: 3")):
         with pytest.raises(SessionError):  # another name, an installed one's, no recipe
-            served.server.request("PUT", f"/api/v1/recipes/{name}", {"recipe_text": text}, 20.0)
+            served.server.request("PUT", f"/api/v1/own-recipes/{name}", {"recipe_text": text}, 20.0)
     known = served.server.request("GET", "/api/v1/recipes", None, 20.0)
     assert [each["name"] for each in known if each["own"]] == ["brief"]
     assert served.server.request("GET", "/api/v1/recipes/brief", None, 20.0)["name"] == "brief"
 
-    served.post("recipes/rehearse", recipe="brief")
+    served.post("rehearsals", recipe="brief")
     served.until(lambda _: _find_event(served, "rehearsed") is not None)
     session = _find_event(served, "rehearsed")["data"]["session"]
     assert inspect_session(served.out / session).simulated
     assert served.state().queue == ()  # a rehearsal is no run of the stand
 
-    served.server.request("DELETE", "/api/v1/recipes/brief", None, 20.0)
+    served.server.request("DELETE", "/api/v1/own-recipes/brief", None, 20.0)
     with pytest.raises(SessionError):
-        served.post("recipes/preview", recipe="brief")
+        served.post("previews", recipe="brief")
 
 
 def _find_event(served, kind):

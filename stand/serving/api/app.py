@@ -97,7 +97,7 @@ def make_command_routes(bridge: Bridge) -> APIRouter:
         """Return what replacing these steps would say, step by step; changes nothing."""
         return _make_response(await bridge.check_edit(body.from_index, body.steps))
 
-    @router.post("/recipes/preview", response_model=RunPreview)
+    @router.post("/previews", response_model=RunPreview)
     async def preview(body: RunRequest) -> Response:
         """Return what a recipe would do on this stand now: its course over time, frames, bytes, end; queues nothing."""
         return _make_response(await bridge.ask(lambda service: service.preview(body)))

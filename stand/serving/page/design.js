@@ -47,7 +47,7 @@ export class Design {
     const asked = ++this.asked;
     clearTimeout(this.timer);
     let answer;
-    try { answer = await send("POST", "/recipes/preview", request()); } catch (error) {
+    try { answer = await send("POST", "/previews", request()); } catch (error) {
       if (asked === this.asked) this.refuse(error.message);
       return;
     }
