@@ -623,7 +623,7 @@ def test_a_session_with_as_many_steps_as_are_looked_for_may_have_more(numbers: R
     one = BumpNumbers(
         "night-1", "2026-01-01T00:00:00", "2026-01-01T00:01:00", 0, 1, (0.1,) * 4, (0.01,) * 4, None, "moved"
     )
-    said = "as many steps were found as are looked for"
-    assert said in render_numbers(replace(numbers, bumps=(one,) * MOST_STEPS))
-    assert said not in render_numbers(replace(numbers, bumps=(one,) * (MOST_STEPS - 1)))
-    assert said not in render_numbers(replace(numbers, bumps=(replace(one, marker=3),) * MOST_STEPS))
+    stated = "as many steps were found as are looked for"
+    assert stated in render_numbers(replace(numbers, bumps=(one,) * MOST_STEPS))
+    assert stated not in render_numbers(replace(numbers, bumps=(one,) * (MOST_STEPS - 1)))
+    assert stated not in render_numbers(replace(numbers, bumps=(replace(one, marker=3),) * MOST_STEPS))

@@ -164,13 +164,13 @@ class FakeService(StandService):
     async def preview(self, request: RunRequest) -> RunPreview:
         raise Conflict("no queue is kept here")
 
-    async def save_recipe(self, who: Who, given: SaveRequest) -> str:
+    async def save_recipe(self, who: Requester, given: SaveRequest) -> str:
         return f"saved as {given.recipe}"
 
-    async def remove_recipe(self, who: Who, given: RecipeRequest) -> str:
+    async def remove_recipe(self, who: Requester, given: RecipeRequest) -> str:
         raise Missing("no recipe of that name was saved here")
 
-    async def rehearse(self, who: Who, given: RunRequest) -> str:
+    async def rehearse(self, who: Requester, given: RunRequest) -> str:
         return "rehearsed"
 
     def devices(self) -> tuple[DeviceState, ...]:

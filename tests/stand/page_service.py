@@ -51,6 +51,8 @@ from thermostand.stand.serving.api_models import (
     PromptState,
     QueuedRun,
     Requester,
+    RunPreview,
+    RunRequest,
     RunStatus,
     StandState,
     StepStanding,

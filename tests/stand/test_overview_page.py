@@ -21,7 +21,7 @@ async def test_the_page_shows_a_card_each_links_to_their_pages_and_stops_one(
     desk = Remote("cold", runs=True)
     async with open_remote(tmp_path / "cold", desk) as stand:
         port = free_port()
-        async with serve_cycle(tmp_path / "night", port, stands=(stand,)), a_page(chromium, port, "stands") as page:
+        async with serve_cycle(tmp_path / "cycle", port, stands=(stand,)), a_page(chromium, port, "stands") as page:
             card = page.locator(".card", has_text="cold").first
             await card.get_by_text("running", exact=True).wait_for()
             assert await card.get_by_role("link", name="cold").get_attribute("href") == stand.url

@@ -28,7 +28,7 @@ async def choose(page, recipe):
 async def test_what_a_session_will_do_follows_what_is_typed(desk):
     desk.queue = []
     async with a_page(desk.chromium, desk.port, "queue", DESKTOP) as page:
-        before = await choose(page, "thermal-desk")
+        before = await choose(page, "thermal-cycle")
         await page.get_by_text("it begins at once").wait_for()
         assert await page.locator("div.course circle.capture").count() == len(before["course"]["captures"]) == 49
         await page.get_by_text("Look at and change its parameters").click()
@@ -50,7 +50,7 @@ async def test_what_a_session_will_do_follows_what_is_typed(desk):
 
 async def test_a_level_is_moved_with_keys_and_by_dragging(desk):
     async with a_page(desk.chromium, desk.port, "queue", DESKTOP) as page:
-        await choose(page, "thermal-desk")
+        await choose(page, "thermal-cycle")
         level = page.get_by_role("slider", name="set-point 48 °C")
         async with page.expect_response("**/previews") as answer:
             await level.press("ArrowUp")

@@ -32,7 +32,7 @@ export class Overview {
 
   card(card) {
     const answer = h("p", { class: "answer", role: "status" });
-    const stop = h("button", { type: "button", class: "stop-there", onclick: () => this.stop(card, answer) }, `STOP ${card.name}`);
+    const stop = h("button", { type: "button", class: "stop-stand", onclick: () => this.stop(card, answer) }, `STOP ${card.name}`);
     const path = `/api/v1/overview/${card.key}/frame.jpg`;
     const image = h("img", { alt: `The last frame of ${card.name}`, "data-src": path, hidden: true, onload: () => { image.hidden = !image.naturalWidth; }, onerror: () => { image.hidden = true; } });
     const rows = [["set-point", card.set_point_degC], ["air", card.air_degC], ["camera", card.camera_degC]].filter(([, value]) => value !== null).map(([name, value]) => [name, `${number(value, 1)} °C`]);
