@@ -96,6 +96,9 @@ class _Sibling:
     found: SegmentScan
 
 
+_MANIFEST_PART = f".{MANIFEST_NAME}.*.part"  # as foundation/files.py names what is not yet in its place
+
+
 def find_opening(path: Path, own: SegmentScan) -> SegmentOpening | None:
     """The opening for the segment at `path`, of which `own` proved itself; None when its session is not known."""
     siblings = [sibling for sibling in _iterate_siblings(path) if _is_same_session(own, sibling.found)]
@@ -254,6 +257,8 @@ def salvage_session(directory: Path, report: ReportShare = no_report) -> list[Sa
 def salvage_unfinished(root: Path, report: ReportShare = no_report) -> list[Salvaged]:
     """Finish the unfinished segments of every session below `root`, without a look at the finished ones. SessionError
     as above."""
+    for part in root.glob(f"*/{_MANIFEST_PART}"):
+        _remove_manifest_part(part)
     left = {path.parent for pattern in (UNFINISHED, TEMPORARY) for path in root.glob(f"*/*/*{pattern}")}
     folders = [folder for folder in sorted(left, reverse=True) if folder.name in LEVELS]  # telemetry is first
     found = _salvage_folders(folders, False, report)
@@ -270,10 +275,19 @@ def _update_manifest(directory: Path) -> Iterator[Salvaged]:
         file.state is SegmentState.DAMAGED for file in files
     ):
         return  # its recorder writes it, or there is nothing to list
+    for part in directory.glob(_MANIFEST_PART):
+        _remove_manifest_part(part)
     path = directory / MANIFEST_NAME
     with _convert_disk_errors(path), suppress(SessionError):
         if reason := complete_manifest(directory):
             yield Salvaged(path, path, 0, 0, reason, None)
+
+
+def _remove_manifest_part(part: Path) -> None:
+    """Remove a manifest that was killed before it had its name; not what a recorder that lives is writing."""
+    if not any(file.state is SegmentState.RECORDING for file in list_segments(part.parent)):
+        with _convert_disk_errors(part):
+            part.unlink(missing_ok=True)
 
 
 def _salvage_folders(folders: Iterable[Path], finished_too: bool, report: ReportShare) -> list[Salvaged]:

@@ -94,7 +94,7 @@ def add_sensor_noise(clean_DN: Float, bits: int, seed: int) -> Image:
 
 def _make_peer_codecs(bits: int) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]]:
     """Lossless codecs by their names, one thread each, at the levels that their makers take."""
-    import imagecodecs as codecs
+    import imagecodecs as codecs  # pyright: ignore[reportMissingImports] - optional
 
     return {
         "PNG (zlib 6)": (lambda image: codecs.png_encode(image, level=6), codecs.png_decode),

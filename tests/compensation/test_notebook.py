@@ -14,7 +14,7 @@ from .conftest import Recorded
 def test_the_notebook_runs_on_a_recorded_session(recorded: Recorded, tmp_path: Path):
     (tmp_path / "sessions").mkdir()
     (tmp_path / "sessions" / "small-demo").symlink_to(recorded.path)
-    assert len(execute(tmp_path)) == 5
+    assert len(execute(tmp_path)) == 6
 
 
 def test_the_notebook_is_shown_with_what_its_cells_have_given():

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -134,6 +135,7 @@ def test_an_error_is_json_where_that_was_asked_for(program: str, words: str, sta
 
 
 # What each command is reported besides the session that is not there.
+ORDER = Path(__file__).parents[2] / "configs" / "orders" / "example.yaml"
 OF_A_SESSION = {
     "stand resume": "",
     **{f"stand {verb}": "" for verb in ("status", "watch", "foxglove", "pause", "continue", "reset", "stop")},
@@ -146,6 +148,7 @@ OF_A_SESSION = {
     "compensate fit": "-o m.json",
     "compensate report": "-o r.html",
     "compensate datasheet": "-o d.html",
+    "compensate certificate": f"--order {ORDER} -o d.html",
     "compensate calibrate": "-o c.json",
     "compensate detect": "-o c.csv",
     "compensate validate": "-o v.html --camera nowhere --model nowhere",

@@ -73,7 +73,8 @@ def test_every_settings_model_of_a_driver_is_a_part_of_the_stands_file():
     models = {
         each for each in classes(thermostand.drivers.devices, thermostand.drivers.wires) if issubclass(each, Document)
     }
-    base = {"ChamberUnitSettings", "AravisCameraSettings"}  # of those of each make or kind
+    # Of those of each make or kind, and those of a kind that stands under `devices`.
+    base = {"ChamberUnitSettings", "AravisCameraSettings", "UpsSettings", "UpsSecrets"}
     assert {each.__name__ for each in models} - {
         each.__name__ for each in models_in(StandConfig)
     } == REGISTER_MAP | base

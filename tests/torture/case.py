@@ -116,6 +116,7 @@ _HAS: dict[str, Callable[[dict[str, str]], bool]] = {
     "rotary": lambda stand: stand["axes"] != "no axes",
     "thermometer": lambda stand: stand["thermometers"] != "16",
     "thermometers": lambda stand: stand["thermometers"] != "16",
+    "ups": lambda stand: False,  # no drawn stand has one: a UPS that is told to end runs would hide what else is wrong
 }
 # What happens in real time on a wire or at a camera races with the program: such a seed would not repeat.
 _RACES = {
