@@ -21,7 +21,7 @@ ARGUMENTS = (
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )
 DESKTOP, PHONE = (1440, 980), (390, 844)
-VIEWS = ("now", "plan", "queue", "camera", "sessions", "devices")
+VIEWS = ("now", "plan", "queue", "camera", "sessions", "devices", "stands")
 # A broken connection and a request that the stand refuses are shown on the page, and by chromium in its console.
 _EXPECTED = ("Failed to load resource", "WebSocket connection to")
 

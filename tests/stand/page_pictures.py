@@ -26,7 +26,8 @@ async def take(folder: Path) -> None:
             async with serve_cycle(Path(sessions) / "sessions", port, with_frames=True) as desk:
                 for name, view, size, scheme in (
                     ("page-now", "now", WIDE, "light"),
-                    ("page-plan", "plan", (1280, 620), "dark"),
+                    ("page-plan", "plan", (1280, 760), "dark"),
+                    ("page-design", "queue", (1280, 760), "light"),
                     ("page-camera", "camera", WIDE, "dark"),
                     ("page-phone", "now", PHONE, "dark"),
                 ):
@@ -35,6 +36,8 @@ async def take(folder: Path) -> None:
                         if view == "now":
                             await page.get_by_role("button", name="12 h").click()
                             await page.get_by_text("markers found").wait_for()
+                        if view == "queue":
+                            await page.locator(".course svg").first.wait_for()
                         if view == "plan":
                             await page.get_by_text("soak").first.wait_for()
                         await page.wait_for_timeout(2000)

@@ -3,7 +3,7 @@ import { send } from "./api.js";
 import { bytes, clock, day_clock, duration, fill, h, number, say, seconds } from "./dom.js";
 
 const WAIT_MS = 120; // after the last key; the stand answers in less
-const HIGH = 240, LEFT = 52, BOTTOM = 26, TOP = 12;
+const HIGH = 240, LEFT = 60, BOTTOM = 26, TOP = 12;
 const STEP_degC = 0.5; // a level is dragged by
 
 const svg = (tag, attributes = {}, ...children) => {
@@ -107,7 +107,7 @@ export function course_svg(preview, width, offset_ns, { drag = null, now_s = nul
   return svg("svg", { viewBox: `0 0 ${WIDE} ${HIGH}`, role: "group", "aria-label": preview.label ?? describe(preview) },
     band(Math.max(low, chamber_degC[1]), high, "limit"), band(low, Math.min(high, chamber_degC[0]), "limit"),
     dew_degC === null ? null : band(low, Math.min(high, dew_degC), "dew"),
-    ticks_degC(low, high).map((degC) => [svg("line", { class: "grid-line", x1: LEFT, x2: WIDE - 8, y1: y(degC), y2: y(degC) }), svg("text", { x: LEFT - 6, y: y(degC) + 4, "text-anchor": "end" }, `${degC} °C`.replace("-", "−"))]),
+    ticks_degC(low, high).map((degC) => [svg("line", { class: "grid-line", x1: LEFT, x2: WIDE - 8, y1: y(degC), y2: y(degC) }), svg("text", { x: LEFT - 12, y: y(degC) + 4, "text-anchor": "end" }, `${degC} °C`.replace("-", "−"))]),
     ticks_s(last_s, begin_ns, offset_ns, WIDE / 100).map(([s, text]) => svg("text", { x: x(s), y: HIGH - 8, "text-anchor": "middle" }, text)),
     course.soaks.map(({ from_s, to_s }) => svg("rect", { class: "soak", x: x(from_s), width: Math.max(1, x(to_s) - x(from_s)), y: HIGH - BOTTOM, height: 5 })),
     svg("path", { class: "camera", d: path(course.camera_degC) }), svg("path", { class: "air", d: path(course.air_degC) }), svg("path", { class: "set", d: path(course.set_point_degC) }),
