@@ -45,6 +45,7 @@ from thermostand.foundation.repeat_limit import RepeatLimit
 from thermostand.foundation.tasks import cancel_all, describe_failure, run_with_background
 from thermostand.foundation.worker_process import WorkerProcess
 from thermostand.foundation.workers import WorkerThread
+from thermostand.recording.reading.run_status import RunOutcome
 from thermostand.recording.repair.salvage import format_salvaged, salvage_unfinished
 from thermostand.recording.writing.disk import FILES_LINE
 from thermostand.recording.writing.recorder import FINISH_WITHIN_S
@@ -284,7 +285,7 @@ class Daemon(Host):
             raise Interrupted("the daemon ends")
         if self.open_stand.latch.fault is not None:
             raise StandTripped(f"the stand has tripped: {self.open_stand.latch.fault.text}")
-        has_begun = False
+        has_begun = has_ended = False
         self._run_id = entry.id
 
         def begun() -> None:
@@ -293,7 +294,12 @@ class Daemon(Host):
             self._start_task(self._hand_over())
 
         def follow(item: Item) -> None:
-            if has_begun and isinstance(item, Event) and item.kind == RUN_END and not self._orders.leaving:
+            nonlocal has_ended
+            if not isinstance(item, Event) or item.kind != RUN_END:
+                return
+            # A resumed run states the end of what was killed before it goes on.
+            has_ended = has_ended or item.data.get("status") != RunOutcome.INTERRUPTED
+            if has_begun and not self._orders.leaving:
                 self._start_task(self._record_after_run())
 
         self.has_admitted_run = True
@@ -306,8 +312,8 @@ class Daemon(Host):
                 await self._assembly.stand.chamber.stop()
             return await self._perform(entry, notes, begun)
         except StandError as error:
-            if not has_begun and not isinstance(error, Interrupted):
-                self._publish(RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}")
+            if not has_begun and not has_ended and not isinstance(error, Interrupted):
+                self._publish(RUN_FAILED, f"run {entry.id} ({entry.recipe}) has not begun: {error}", run=entry.id)
             raise
         finally:
             self._hub.unsubscribe(follow)

@@ -79,8 +79,8 @@ class AlertTracker:
         if event.kind in (*RUN_BEGINS, RUN_END):
             self._open = {}
             self._run_ended = event.kind == RUN_END
-        elif event.kind == RUN_FAILED and self._run_ended:
-            return []
+        elif event.kind == RUN_FAILED and self._run_ended and "run" not in event.data:
+            return []  # its end was an alert; a run of a queue that has not begun is another one
         if alert.cause not in _BAD:
             return self._limit([(alert.cause, TITLES[alert.cause], event.text)], now_ns)
         known = self._open.get((alert.cause, alert.key))

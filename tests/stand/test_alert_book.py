@@ -109,6 +109,7 @@ def test_a_run_that_fails_before_it_begins_is_reported_and_one_that_ended_not_tw
     found = book()
     assert len(reported(found, event("run_failed", 0))) == 1
     assert len(reported(found, event("run.end", 1, status="failed"), event("run_failed", 1))) == 1
+    assert len(reported(found, event("run_failed", 2, run=7))) == 1  # the next one of a queue
 
 
 def test_in_an_hour_only_so_many_are_sent_but_every_trip():
