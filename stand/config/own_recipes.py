@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from thermostand.foundation.documents import parse_document
-from thermostand.foundation.errors import ConfigError, NotFound
+from thermostand.foundation.documents import parse_document, read_document
+from thermostand.foundation.errors import ConfigError, NotFound, SessionError
 from thermostand.foundation.files import make_folder, replace_file
 from thermostand.stand.config.recipe import Recipe
 from thermostand.stand.config.stand_config import find_packaged
@@ -31,24 +31,23 @@ def list_recipes(sessions: Path) -> Iterator[NamedRecipe]:
     for folder, own in ((_get_installed(), False), (sessions / OWN_RECIPES, True)):
         for path in sorted(folder.glob("*.yaml")):
             if _NAME.fullmatch(path.stem):
-                yield NamedRecipe(path.stem, path.read_text("utf-8"), own)
+                # One that is no text is listed, too; reading it says what is wrong with it.
+                yield NamedRecipe(path.stem, path.read_text("utf-8", errors="replace"), own)
 
 
 def read_recipe(sessions: Path, name: str) -> str:
-    """The text of the recipe of that name; NotFound lists what there is."""
+    """The text of the recipe of that name; NotFound lists what there is, ConfigError when it cannot be read."""
     if _NAME.fullmatch(name):
         for folder in (_get_installed(), sessions / OWN_RECIPES):
-            try:
-                return (folder / f"{name}.yaml").read_text("utf-8")
-            except FileNotFoundError:
-                continue
+            if (path := folder / f"{name}.yaml").is_file():
+                return read_document(path)
     known = ", ".join(each.name for each in list_recipes(sessions))
     raise NotFound(f"no recipe of that name is installed or saved here; there are {known}")
 
 
 def save_recipe(sessions: str, name: str, text: str) -> None:
     """Keep an own recipe, in the place of one of that name; ConfigError when it is none, is called otherwise, or has
-    the name of an installed one; OSError when the disk refuses."""
+    the name of an installed one; SessionError when the disk refuses."""
     recipe = parse_document(text, Recipe, "the recipe")
     if recipe.name != name:
         raise ConfigError(f"the recipe's own name is {recipe.name}; save it under that, or change it to {name}")
@@ -56,15 +55,21 @@ def save_recipe(sessions: str, name: str, text: str) -> None:
         raise ConfigError(f"{name} is an installed recipe, which stays as it is; give yours another name")
     folder = Path(sessions) / OWN_RECIPES
     make_folder(folder)
-    replace_file(folder / f"{name}.yaml", text.encode())
+    try:
+        replace_file(folder / f"{name}.yaml", text.encode())
+    except OSError as error:
+        raise SessionError(f"{folder}: the recipe cannot be saved ({error.strerror})") from error
 
 
 def remove_recipe(sessions: str, name: str) -> None:
-    """Remove an own recipe; NotFound when there is none of that name."""
+    """Remove an own recipe; NotFound when there is none of that name, SessionError when the disk refuses."""
     path = Path(sessions) / OWN_RECIPES / f"{name}.yaml"
     if not _NAME.fullmatch(name) or not path.is_file():
         raise NotFound("no recipe of that name was saved here; those that are installed stay")
-    path.unlink()
+    try:
+        path.unlink()
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be removed ({error.strerror})") from error
 
 
 def _get_installed() -> Path:

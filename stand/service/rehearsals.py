@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 import sys
-import tempfile
-from contextlib import suppress
 from pathlib import Path
 
 from thermostand.foundation.clock import Clock
@@ -39,39 +39,48 @@ class Rehearsals:
 
     async def _rehearse(self, recipe: str, recipe_text: str) -> None:
         async with self._turn:
-            with tempfile.TemporaryDirectory(prefix="thermostand-rehearsal-") as folder:
-                path = Path(folder) / f"{recipe}.yaml"
-                path.write_text(recipe_text, encoding="utf-8")
-                try:
-                    session = await self._run(path)
-                    event = REHEARSED.at(self._clock.now_ns(), recipe=recipe, session=session)
-                except (OSError, SessionError) as error:
-                    event = NOT_REHEARSED.at(self._clock.now_ns(), str(error), recipe=recipe)
-                self._hub.publish(event)
+            try:
+                event = REHEARSED.at(self._clock.now_ns(), recipe=recipe, session=await self._run(recipe_text))
+            except (OSError, SessionError) as error:
+                event = NOT_REHEARSED.at(self._clock.now_ns(), str(error), recipe=recipe)
+            self._hub.publish(event)
 
-    async def _run(self, recipe: Path) -> str:
+    async def _run(self, recipe_text: str) -> str:
         """The name of the session; SessionError with what the program says when it ends otherwise."""
-        command = [sys.executable, "-m", "thermostand.stand.cli", "run", str(recipe), "--config", self._config]
-        process = await asyncio.create_subprocess_exec(
-            "nice",  # a run that is under way, and its guard, get three times its share of a busy processor
-            "-n5",
-            *command,
-            "--virtual-time",
-            "--out",
-            str(self._sessions),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,
-        )
+        # In memory: this is the control loop, which waits for no disk.
+        recipe = os.memfd_create("recipe.yaml")
+        try:
+            os.write(recipe, recipe_text.encode())
+            process = await asyncio.create_subprocess_exec(
+                "nice",  # a run that is under way, and its guard, get three times its share of a busy processor
+                "-n5",
+                *(sys.executable, "-m", "thermostand.stand.cli", "run", f"/dev/fd/{recipe}"),
+                *("--config", self._config, "--virtual-time", "--out", str(self._sessions)),
+                pass_fds=(recipe,),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                start_new_session=True,
+            )
+        finally:
+            os.close(recipe)
         try:
             out, err = await process.communicate()
-        except asyncio.CancelledError:
-            process.terminate()
-            with suppress(TimeoutError):
-                await asyncio.wait_for(process.wait(), _END_WITHIN_S)
-            raise
+        finally:
+            await _end(process)
         if process.returncode:
             last = err.decode(errors="replace").strip().splitlines()
             raise SessionError(last[-1] if last else f"status {process.returncode}")
         return Path(out.decode().strip().splitlines()[-1]).name
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    """End a program that has not ended, at last with all that it has started."""
+    if process.returncode is not None:
+        return
+    process.terminate()
+    try:
+        await asyncio.wait_for(process.wait(), _END_WITHIN_S)
+    except TimeoutError:
+        os.killpg(process.pid, signal.SIGKILL)
+        await process.wait()

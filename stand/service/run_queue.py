@@ -210,7 +210,10 @@ class RunQueue:
 
     async def save_recipe(self, name: str, text: str) -> None:
         """Keep a recipe of one's own; ConfigError for what is wrong with it."""
-        await self.disk.call(save_recipe, str(self.directory), name, text)
+        try:
+            await self.disk.call(save_recipe, str(self.directory), name, text)
+        except SessionError as error:
+            raise Conflict(str(error)) from error
 
     async def remove_recipe(self, name: str) -> None:
         """Remove a recipe of one's own; Missing when there is none."""
@@ -218,6 +221,8 @@ class RunQueue:
             await self.disk.call(remove_recipe, str(self.directory), name)
         except NotFound as error:
             raise Missing(str(error)) from error
+        except SessionError as error:
+            raise Conflict(str(error)) from error
 
     async def rehearse_order(self, request: RunRequest) -> str:
         """Begin a rehearsal in virtual time; the recipe's name. ConfigError for what is wrong with it."""

@@ -1,6 +1,8 @@
 """A session that is designed at a daemon: previewed, saved as a recipe of one's own, rehearsed; over its interface."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
@@ -43,3 +45,44 @@ def _find_event(served, kind):
     events = served.server.request("GET", "/api/v1/events?limit=200", None, 20.0)["events"]
     assert not [each for each in events if each.get("kind") == "not_rehearsed"], json.dumps(events[-3:])
     return next((each for each in events if each.get("kind") == kind), None)
+
+
+def test_a_file_that_is_no_recipe_spoils_no_list_and_a_disk_that_refuses_is_an_answer(serve):
+    served = serve()
+    served.until(is_idle)
+    folder = served.out / "recipes"
+    folder.mkdir()
+    (folder / "broken.yaml").write_bytes(b"\xff\xfe name")
+    (folder / "scalar.yaml").write_text("3")
+    assert {"broken", "scalar"} < {each["name"] for each in served.server.request("GET", "/api/v1/recipes", None, 20.0)}
+    for name in ("broken", "scalar"):
+        with pytest.raises(SessionError, match=name):
+            served.server.request("GET", f"/api/v1/recipes/{name}", None, 20.0)
+    shutil.rmtree(folder)
+    folder.write_text("a file where a folder should be")
+    with pytest.raises(SessionError, match="recipes"):
+        served.server.request("PUT", "/api/v1/own-recipes/brief", {"recipe_text": BRIEF}, 20.0)
+    assert is_idle(served.state())
+
+
+def test_a_daemon_that_ends_leaves_no_rehearsal_behind(serve):
+    served = serve()
+    served.until(is_idle)
+    served.post("rehearsals", recipe="overnight")
+    mine = f"--out\0{served.out}\0".encode()
+
+    def rehearsing() -> bool:
+        found = Path("/proc").glob("[0-9]*/cmdline")
+        return any(mine in _read(path) and b"--virtual-time" in _read(path) for path in found)
+
+    served.until(lambda _: rehearsing())
+    served.process.terminate()
+    served.reported()
+    assert not rehearsing()
+
+
+def _read(path):
+    try:
+        return path.read_bytes()
+    except OSError:  # it has ended
+        return b""

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Response
 from fastapi import Path as FromPath
 from pydantic import BaseModel
 
-from thermostand.foundation.documents import parse_yaml
+from thermostand.foundation.documents import parse_document, parse_yaml
 from thermostand.foundation.errors import NotFound, SessionError
 from thermostand.recording.format.inventory import list_segments
 from thermostand.recording.reading.catalogue import ListedSession, SessionCache, inspect_session, load_catalogue
@@ -115,6 +115,7 @@ def make_session_routes(_: Bridge, folder: Path) -> APIRouter:
             text = await disk.ask(lambda: read_recipe(folder, name))
         except NotFound as error:
             raise Missing(str(error)) from None
+        parse_document(text, Recipe, name)  # a form is made of a recipe only
         return cast("dict[str, Any]", parse_yaml(text, name))
 
     @router.get("/sessions", response_model=list[SessionEntry])
