@@ -41,15 +41,16 @@ def watch_mains(name: str, settings: UpsSettings) -> tuple[Watch, ...]:
 
 
 def require_mains(name: str, settings: UpsSettings) -> Rule:
-    """On battery for hold_after_s, until mains has been back for back_after_s. Its status being unknown, or not told,
-    changes nothing."""
+    """On battery for hold_after_s, until mains has been back for back_after_s, as the last answer says: silence neither
+    begins nor ends a hold."""
     lost_ns: int | None = None  # since when it is on battery, as far as is known
     back_ns: int | None = None  # since when mains is back after a loss that counted
     is_lost = False
 
     def rule(readings: Readings, now_ns: int) -> Fault | None:
         nonlocal lost_ns, back_ns, is_lost
-        on_battery = get_value(readings, f"{name}.{ON_BATTERY.name}")
+        reading = readings.known(f"{name}.{ON_BATTERY.name}")
+        on_battery, answered_ns = (math.nan, now_ns) if reading is None else (reading.value, reading.time_ns)
         if on_battery == 1:
             lost_ns, back_ns = now_ns if lost_ns is None else lost_ns, None
             is_lost = is_lost or now_ns - lost_ns >= to_ns(settings.hold_after_s)
@@ -60,7 +61,7 @@ def require_mains(name: str, settings: UpsSettings) -> Rule:
             return None
         if back_ns is None:
             return Fault(MAINS_LOST, f"{name} is on battery: the mains has failed")
-        if now_ns - back_ns < to_ns(settings.back_after_s):
+        if on_battery != 0 or answered_ns - back_ns < to_ns(settings.back_after_s):
             waited = format_duration(to_ns(settings.back_after_s))
             return Fault(MAINS_LOST, f"mains is back at {name}, and is waited for to last for {waited}")
         is_lost, back_ns = False, None

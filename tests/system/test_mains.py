@@ -155,3 +155,15 @@ def test_silence_begins_no_hold_ends_none_and_the_time_that_was_left_goes_on():
     assert ups.look(5020, 1, 900.0) == (True, False)
     assert ups.look(5600, None) == (True, False)
     assert ups.look(5630, None) == (True, True)
+
+
+def test_silence_after_mains_came_back_does_not_end_the_hold():
+    ups = Reported()
+    assert [ups.look(at_s, value)[0] for at_s, value in ((0, 1), (6, 1), (10, 0), (60, None), (500, None))] == [
+        False,
+        True,
+        True,
+        True,
+        True,
+    ]
+    assert ups.look(510, 0) == (False, False)  # it answers again, and mains has been back since
