@@ -96,6 +96,14 @@ def make_durable_folder(path: Path) -> None:
     sync_folder(path.parent)
 
 
+def name_part(out: Path) -> Path:
+    """The name that the new file `out` has until it is whole; SessionError when one of the two is in the way."""
+    part = out.with_name(f"{out.name}.part")
+    if out.exists() or part.exists():
+        raise SessionError(f"{out if out.exists() else part}: is in the way; remove it or choose another name")
+    return part
+
+
 def make_folder(path: Path) -> None:
     """Make a folder as `make_durable_folder` does; SessionError when the place refuses."""
     try:

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from thermostand.foundation.errors import SessionError
-from thermostand.foundation.files import make_durable_folder, sync_folder
+from thermostand.foundation.files import make_durable_folder, name_part, sync_folder
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.exporting.topics import iterate_recorded_messages, list_topics
 from thermostand.recording.format.images import name_frame_topics
@@ -49,9 +49,7 @@ def export_mcap(
     `report` gets the share of the messages that is done (0 to 1). SessionError when the session cannot be read or `out`
     not be written; `out` then does not appear.
     """
-    part = out.with_name(f"{out.name}.part")
-    if out.exists() or part.exists():
-        raise SessionError(f"{out if out.exists() else part}: is in the way; remove it or choose another name")
+    part = name_part(out)
     try:
         make_durable_folder(out.parent)
         with part.open("wb") as file:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from thermostand.foundation.clock import NS_PER_S
 from thermostand.foundation.errors import SessionError
 from thermostand.foundation.extras import import_extra
-from thermostand.foundation.files import make_durable_folder, sync_folder
+from thermostand.foundation.files import make_durable_folder, name_part, sync_folder
 from thermostand.recording.exporting.state import describe_state
 from thermostand.recording.format.decoded_items import decode_frame
 from thermostand.recording.format.messages import FrameMeta
@@ -55,9 +55,7 @@ def export_nexus(
     appear.
     """
     h5py = import_extra("h5py", "nexus")
-    part = out.with_name(f"{out.name}.part")
-    if out.exists() or part.exists():
-        raise SessionError(f"{out if out.exists() else part}: is in the way; remove it or choose another name")
+    part = name_part(out)
     try:
         make_durable_folder(out.parent)
         with h5py.File(part, "x") as file:
